@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from scripts import emulator_accuracy
-from truesky.emulator import examples, model
+from truesky.emulator import model
 
 _IMAGES, _EMULATOR = "#1f3b57", "#d2691e"
 _EDGES = np.arange(19.0, 26.51, 0.5)
@@ -71,10 +71,9 @@ def main():
     options = parser.parse_args()
     fitted = model.read_model(options.model)
     settings, band = emulator_accuracy.settings_of(fitted), options.band or fitted.band
-    parts = [emulator_accuracy.read_frames(path, band, settings, options.detectors) for path in options.lakes]
-    frames = examples.join([part[0] for part in parts])
-    emulated = emulator_accuracy.draw_outcomes(fitted, frames.features)
-    draw(options.out, np.concatenate([part[1] for part in parts]), frames.outcomes, emulated)
+    sample = emulator_accuracy.read_frames(options.lakes, band, settings, options.detectors)
+    emulated = emulator_accuracy.draw_outcomes(fitted, sample.examples.features)
+    draw(options.out, sample.magnitude, sample.examples.outcomes, emulated)
 
 
 if __name__ == "__main__":

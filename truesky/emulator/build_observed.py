@@ -165,14 +165,19 @@ def _check_fluxes(fluxes: read.Version, catalogue: read.Version, bands: Sequence
 
 
 def _check_plan(exposures: read.Version, models: Sequence[Model]) -> None:
-    """Raise BadInput if the plan does not observe the sky with the camera and in the band of each model."""
+    """Raise BadInput if the plan does not observe the band of each model with its camera, and with no other."""
     rows = exposures.rows(["camera", "band", "image_type"])
     rows = rows.filter(pc.is_in(rows["image_type"], pa.array(SKY_TYPES)))
     planned = set(zip(rows["camera"].to_pylist(), rows["band"].to_pylist(), strict=True))
     for model in models:
+        cameras = sorted(camera for camera, band in planned if band == model.band)
+        if len(cameras) > 1:
+            raise BadInput(
+                f"--model: the plan observes {model.band} with the cameras {' and '.join(cameras)}, and the depth does "
+                "not tell them apart: emulate them with requests that have one camera each"
+            )
         if (model.camera, model.band) in planned:
             continue
-        cameras = sorted(camera for camera, band in planned if band == model.band)
         if cameras:
             raise BadInput(
                 f"--model: the model of {model.band} is one of camera {model.camera}, but the plan has {cameras[0]}"

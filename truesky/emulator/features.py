@@ -128,7 +128,8 @@ def find_neighbours(source_ids: Int, ra: Float, dec: Float, is_bright: Bool) -> 
     if not len(vectors):
         return Neighbours(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
     near_chord, far_chord = (2.0 * np.sin(0.5 * np.radians(limit / 3600.0)) for limit in (NEAR, FAR))
-    tree = scipy.spatial.cKDTree(vectors)
+    # The pairs do not depend on the kind of tree, and a balanced one takes 1.6 times as long to build.
+    tree = scipy.spatial.cKDTree(vectors, balanced_tree=False)
     pairs = tree.query_pairs(near_chord, output_type="ndarray")
     source, neighbour = (np.concatenate([pairs[:, a], pairs[:, b]]).astype(np.int64) for a, b in ((0, 1), (1, 0)))
     bright = np.flatnonzero(is_bright)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +12,13 @@ from scipy import ndimage
 from lake_schema import ids
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import OutOfRange
-from truesky.emulator import features, matching
+from lake_schema.fits.images import Card
+from truesky.emulator import features, ideal_masters, matching
 from truesky.emulator.examples import Examples, Outcomes
 from truesky.emulator.features import Features
 from truesky.randomness import rng
 from truesky.reduction import catalogue, files
-from truesky.reduction.calibration import NO_DATA, Masters, ReducedImage
+from truesky.reduction.calibration import COSMIC_RAY, HOT, NO_DATA, RESPONSE, SATURATED, UNSURE, ReducedImage
 from truesky.reduction.catalogue import Limits
 from truesky.reduction.frames import Frame
 from truesky.reduction.infrared import nisp
@@ -31,12 +31,16 @@ from truesky.survey_maps import exposure_noise, psf_sizes
 FAINTEST = 1.5
 # Sources closer to the edge of a detector than this (pixels) are not used as examples.
 _BORDER = 10.0
+# Bits of pixels that are bad in one exposure, but not in others that see the same place with other pixels.
+_BAD = RESPONSE | HOT | UNSURE | COSMIC_RAY
 # Differences from the noise-free image below this fraction of the light are no cosmic rays.
 _TOLERANCE = 0.1
 # Pixels whose difference from the noise-free image is below this number of standard deviations show the mean sky.
 _CLIP = 3.0
 # Signal-to-noise ratio of a point source at the depth.
 _SIGMA = 5.0
+# Detections with a smaller ratio of signal to noise in an aperture count as none; their magnitudes mean nothing.
+_LEAST_SIGNAL = 1.0
 # Highest kind of a source that is in the catalogues; bodies of the solar system have higher ones.
 _LAST_KIND = 5
 
@@ -52,8 +56,8 @@ class Settings:
     aperture : float
         Diameter of the aperture of MAG_APER as a multiple of the FWHM of the PSF, 0.1 to 100.
     cosmic_rays : float
-        Pixels of CCDs that exceed the noise-free image by this number of standard deviations are replaced as cosmic
-        rays, 2 to 1000; 0 to replace none.
+        Pixels that exceed the noise-free image by this number of standard deviations are replaced as cosmic rays, and
+        bad pixels of the detector too, 2 to 1000; 0 to replace none.
 
     Raises
     ------
@@ -141,24 +145,23 @@ def measure(
     settings : Settings
         Settings of calibration, detection and measurement.
     masters : Path, optional
-        Folder with the masters of `truesky masters`. None for the ideal calibration: bias, dark and flat of a perfect
-        detector, so that their patterns stay in the image.
+        Folder with the masters of `truesky masters`. None for the ideal calibration, which knows the dark current and
+        the response of each pixel of the simulated detector; other patterns of its bias stay in the image.
     noise_free : Path, optional
-        Image of the expected electrons of the sources, with which cosmic rays on CCDs are replaced; None to leave them.
+        Image of the expected electrons of the sources, with which cosmic rays and bad pixels are replaced. None to
+        leave cosmic rays on CCDs; other bad pixels then have no weight.
 
     Returns
     -------
     FrameExamples
         Examples of the sources that are at most 1.5 mag fainter than the depth and on pixels with data.
     """
-    without = files.master_kinds(frame) + (("fringes",) if "fringes" in frame.applied else ())
-    without = () if masters is not None else without
-    image, cards = reduce_frame(
-        frame, _masters(frame, masters, without), ReductionOptions("electron", (*without, "persistence"))
-    )
-    if noise_free is not None and settings.cosmic_rays and not frame.scene.ramp:
+    image, cards = _calibrate(frame, masters)
+    if noise_free is not None and settings.cosmic_rays:
         light = np.asarray(read_back.electrons(noise_free).data, float)
-        draws = rng.stream("emulator.cosmic_rays", frame.exposure.exposure_id, frame.detector)
+        # Exposures and detectors have the same names in each request, but the seeds differ.
+        seed = str(frame.card("NOISSEED") or frame.card("SEED"))
+        draws = rng.stream(seed, "emulator.cosmic_rays", frame.exposure.exposure_id, frame.detector)
         image = replace_hits(image, light, settings.cosmic_rays, draws)
     header = {keyword: value for keyword, value, _ in cards}
     scale = float(header["PIXSCALE"])
@@ -252,7 +255,7 @@ def compare(
 
 
 def replace_hits(image: ReducedImage, light: Float, limit: float, draws: np.random.Generator) -> ReducedImage:
-    """Replace the pixels that cosmic rays hit, as a pipeline does that has several exposures of the field.
+    """Replace the pixels that cosmic rays hit and bad ones, as a pipeline does that has several exposures of the field.
 
     Parameters
     ----------
@@ -268,7 +271,8 @@ def replace_hits(image: ReducedImage, light: Float, limit: float, draws: np.rand
     Returns
     -------
     ReducedImage
-        The image, in which hit pixels and their neighbours have the expected light and sky with new noise.
+        The image, in which hit pixels and their neighbours, and pixels that are flagged as bad for other reasons than
+        saturation or missing data, have the expected light and sky with new noise, and the usual weight.
 
     Notes
     -----
@@ -287,9 +291,12 @@ def replace_hits(image: ReducedImage, light: Float, limit: float, draws: np.rand
     tolerance = _TOLERANCE * np.maximum(light, 0.0)
     hits = good & (excess > limit * noise + tolerance)
     hits = good & ndimage.binary_dilation(hits, np.ones((3, 3), bool))
-    values = image.image.copy()
-    values[hits] = sky + light[hits] + noise[hits] * draws.standard_normal(int(hits.sum()))
-    return replace(image, image=values)
+    is_bad = (image.flags & _BAD != 0) & (image.flags & (NO_DATA | SATURATED) == 0)
+    values, weight = image.image.copy(), image.weight.copy()
+    chosen = hits | is_bad
+    values[chosen] = sky + light[chosen] + noise[chosen] * draws.standard_normal(int(chosen.sum()))
+    weight[is_bad] = 1.0 / variance
+    return ReducedImage(values, weight, np.where(is_bad, image.flags & ~np.uint8(_BAD), image.flags))
 
 
 def planned_conditions(frame: Frame, scale: float) -> dict[str, float]:
@@ -310,18 +317,31 @@ def planned_conditions(frame: Frame, scale: float) -> dict[str, float]:
     scene, exposure = frame.scene, frame.exposure
     assert scene.detector is not None
     assert scene.band is not None
-    sky, variance = (
-        float(values[0]) for values in exposure_noise.variances([exposure], [scene.detector], scene.mission)
-    )
+    sky, variance = _blank_sky(frame)
     psf_area, _ = psf_sizes.sizes(exposure, scene.detector, scene.band, scene.mission, 0)
     electrons = _SIGMA * np.sqrt(variance * psf_area / scale**2)
     depth = exposure.zero_point + 2.5 * np.log10(exposure.exposure_time_s / electrons)
     return {"depth": float(depth), "psf_area": psf_area, "sky": sky}
 
 
-def _masters(frame: Frame, folder: Path | None, without: tuple[str, ...]) -> Masters:
-    read: Callable[..., Masters] = nisp.read_masters if frame.scene.ramp else files.read_masters
-    return read(folder or Path(), frame, without)
+def _calibrate(frame: Frame, folder: Path | None) -> tuple[ReducedImage, tuple[Card, ...]]:
+    """Calibrate a frame with the masters of a folder, or ideal ones; return the image in electrons and its header."""
+    options = ReductionOptions("electron", ("persistence",))
+    if folder is not None:
+        read = nisp.read_masters if frame.scene.ramp else files.read_masters
+        return reduce_frame(frame, read(folder, frame, ()), options)
+    kinds = files.master_kinds(frame) + (("fringes",) if "fringes" in frame.applied else ())
+    _, variance = _blank_sky(frame)
+    masters = ideal_masters.known_masters(frame, kinds, variance)
+    return reduce_frame(frame, masters, replace(options, without=(*kinds, *options.without)))
+
+
+def _blank_sky(frame: Frame) -> tuple[float, float]:
+    """Return the planned sky (electron/s/pixel) and the variance of a pixel of blank sky (electron^2)."""
+    scene = frame.scene
+    assert scene.detector is not None
+    sky, variance = exposure_noise.variances([frame.exposure], [scene.detector], scene.mission)
+    return float(sky[0]), float(variance[0])
 
 
 def _is_example(sources: TrueSources, image: ReducedImage, depth: float) -> Array:
@@ -346,14 +366,13 @@ def _outcomes(
 ) -> dict[str, Array]:
     """Return the outcomes of sources with these detections (-1 for none), besides radius and position.
 
-    A detection whose flux is not positive, or whose size is not measured, counts as none.
+    A detection counts as none if the ratio of signal to noise in one of its apertures is below 1, or if it has no size.
     """
     out: dict[str, Array] = {}
-    detected = (
-        (number >= 0)
-        & (_values_of(measured["flux_auto"], number) > 0.0)
-        & (_values_of(measured["flux_aper"], number) > 0.0)
-    )
+    detected = np.asarray(number >= 0) & (_values_of(measured["flux_radius"], number) > 0.0)
+    for kind in ("auto", "aper"):
+        flux, error = (_values_of(measured[f"{name}_{kind}"], number) for name in ("flux", "fluxerr"))
+        detected &= (flux > 0.0) & (flux >= _LEAST_SIGNAL * error)
     for kind in ("auto", "aper"):
         flux = np.where(detected, _values_of(measured[f"flux_{kind}"], number), np.nan)
         out[f"mag_{kind}"] = geometry.zero_point - 2.5 * np.log10(flux) - magnitude

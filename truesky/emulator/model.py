@@ -48,8 +48,9 @@ class Model:
     Attributes
     ----------
     facts : mapping
-        Camera, band, settings of the detection, and conditions of the training: smallest and largest `depth`, `sky` and
-        `psf_area`, number of frames, and code.
+        Camera, band, settings of the detection, calibration (with masters or not, and the level above which cosmic rays
+        were replaced), and conditions of the training: smallest and largest `depth`, `sky` and `psf_area`, number of
+        frames, and code.
     examples : Examples
         Sources and their measurements.
     lookup : Lookup

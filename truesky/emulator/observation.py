@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
+import scipy
 
 from lake_schema import sky
 from lake_schema.arrays import Array, Bool, Float, Int
@@ -13,11 +14,18 @@ from truesky.emulator import features, lookup
 from truesky.emulator.examples import Outcomes
 from truesky.emulator.features import Features, Neighbours
 from truesky.emulator.model import Model
-from truesky.randomness.per_source import PerSourceGenerator
+from truesky.randomness.per_source import AnyGenerator, PerSourceGenerator
 
 # Magnitudes, their errors (mag) and radii (arcsec) are at most these. A detection with hardly any flux has huge ones;
 # source-extractor writes 99 for magnitudes without flux.
 _LARGEST_MAGNITUDE, _LARGEST_RADIUS = 99.0, 1e3
+# Correlations of two bands, measured in the same fields in VIS and NISP J (docs/emulator.md). Numbers of a source in a
+# band are normal deviates that have a share of their variance in common with the numbers of other bands. Between two
+# brightnesses (magnitude minus depth) the share falls linearly. Sources are blended in all bands or in none, mostly.
+_BLENDING_SHARE = ((-3.0, -1.0), (0.95, 0.75))
+# Errors of magnitudes and sizes are common because of the profile of a galaxy and its neighbours, which matter less in
+# more noise.
+_MAGNITUDE_SHARE = ((-4.5, -1.5), (0.7, 0.12))
 # Measured positions differ by this much (arcsec) from the true ones at most, so that the margins of cells suffice.
 _LARGEST_SHIFT = 1.0
 
@@ -110,10 +118,12 @@ def observe(
         is_bright |= sources.magnitude[band] - depth < -features.BRIGHT
     pairs = features.find_neighbours(sources.ids, sources.ra, sources.dec, is_bright)
     columns: dict[str, Array] = {}
+    common_generator = PerSourceGenerator(sources.ids, seed, "emulator.common")
+    common = common_generator.standard_normal(), common_generator.standard_normal()
     east, north, detected = np.zeros(len(sources.ids)), np.zeros(len(sources.ids)), np.zeros(len(sources.ids), bool)
     for model in models:
         condition = conditions[model.band]
-        band_observation = _observe_band(sources, condition, model, pairs, seed)
+        band_observation = _observe_band(sources, condition, model, pairs, (seed, common))
         is_detected = band_observation.outcomes.detected
         is_first = is_detected & ~detected
         for shift, axis in ((east, band_observation.outcomes.dx), (north, band_observation.outcomes.dy)):
@@ -161,13 +171,51 @@ def band_features(
     return Features(brightness, np.log10(radius / psf), blending, features.is_point(sources.ids)), psf, radius
 
 
-def _observe_band(sources: Sources, condition: Conditions, model: Model, pairs: Neighbours, seed: int) -> Observation:
+def draw_outcomes(
+    model: Model, source_features: Features, generator: AnyGenerator, common: tuple[Float, Float]
+) -> Outcomes:
+    """Draw the outcomes of n sources in one band.
+
+    Parameters
+    ----------
+    model : Model
+        Model of the band.
+    source_features : Features
+        Features in the band.
+    generator : PerSourceGenerator or numpy Generator
+        Generator of the band.
+    common : (float array, float array), each of shape (n,)
+        Normal deviates for blending and for magnitudes, which are the same in each band.
+
+    Returns
+    -------
+    Outcomes
+        Outcomes of examples. Blending and errors of magnitudes are correlated with other bands, and detection of
+        sources that are not blended is not.
+    """
+    count = len(source_features.brightness)
+    node = lookup.nodes(source_features, tuple(generator.random(count) for _ in range(3)))
+    shares = (np.interp(source_features.brightness, *share) for share in (_BLENDING_SHARE, _MAGNITUDE_SHARE))
+    # Correlated uniform numbers: the distribution function of normal deviates (a Gaussian copula).
+    blending, magnitude = (
+        scipy.special.ndtr(np.sqrt(share) * normal + np.sqrt(1.0 - share) * generator.standard_normal(count))
+        for share, normal in zip(shares, common, strict=True)
+    )
+    index = lookup.draw_in_steps(model.lookup, node, blending, generator.random(count), magnitude)
+    return model.examples.outcomes.select(index)
+
+
+def _observe_band(
+    sources: Sources,
+    condition: Conditions,
+    model: Model,
+    pairs: Neighbours,
+    randomness: tuple[int, tuple[Float, Float]],
+) -> Observation:
+    """Return the observation of one band; `randomness` is the seed, and the common numbers of all bands."""
     source_features, psf, radius = band_features(sources, condition, model.band, pairs)
-    band_generator = PerSourceGenerator(sources.ids, seed, "emulator", model.band)
-    # The bands are drawn independently: the correlation of their errors has not been measured.
-    draw = band_generator.random
-    numbers = draw(), draw(), draw(), draw()
-    outcomes = model.examples.outcomes.select(lookup.draw(model.lookup, source_features, numbers))
+    generator = PerSourceGenerator(sources.ids, randomness[0], "emulator", model.band)
+    outcomes = draw_outcomes(model, source_features, generator, randomness[1])
     can_be_seen = condition.is_covered & model.has_examples(source_features)
     values = {field.name: getattr(outcomes, field.name) for field in fields(Outcomes)}
     values |= {name: values[name] & can_be_seen for name in ("detected", "blended")}

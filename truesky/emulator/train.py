@@ -69,7 +69,9 @@ def run_command(options: argparse.Namespace) -> int:
     examples = example_tables.join([sample.examples for sample in samples])
     if len(examples) < _LEAST_EXAMPLES:
         raise BadInput(f"{len(examples)} sources are too few for a model: it needs {_LEAST_EXAMPLES}, better 50,000")
-    digest = model.write_model(path, examples, {**_facts(frames, samples, settings), "faintest": _faintest(samples)})
+    calibration = {"masters": options.masters is not None, "cosmic_rays": settings.cosmic_rays}
+    facts = {**_facts(frames, samples, settings), "calibration": calibration, "faintest": _faintest(samples)}
+    digest = model.write_model(path, examples, facts)
     few = f"; better {_FEW_EXAMPLES}" if len(examples) < _FEW_EXAMPLES else ""
     print(
         f"{user_files.format_path(path)}: {len(examples)} examples of {frames[0].exposure.band}{few}, sha256 {digest}"
@@ -229,5 +231,6 @@ def _facts(frames: Sequence[Frame], samples: Sequence[FrameExamples], settings: 
 
 
 def _faintest(samples: Sequence[FrameExamples]) -> float:
-    """Return the brightness to which all frames have examples: the catalogue may end above the limit."""
-    return min(float(sample.examples.features.brightness.max()) for sample in samples)
+    """Return the brightness to which all frames with examples have some: the catalogue may end above the limit."""
+    brightness = [sample.examples.features.brightness for sample in samples if len(sample.examples)]
+    return min(float(values.max()) for values in brightness)

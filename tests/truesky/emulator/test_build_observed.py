@@ -102,11 +102,11 @@ def publish_depth(lake, cells, bands=BANDS, depth=26.2):
     publish.make_version(lake, Plan(DEPTH, {"depth": depth, "bands": list(bands), "exposures": plan}, tasks), rows)
 
 
-def publish_plan(lake, cameras=("vis", "vis")):
+def publish_plan(lake, cameras=("vis", "vis"), bands=BANDS):
     exposures = rows_of(EXPOSURES, 2).to_pydict()
-    exposures |= {"camera": list(cameras), "band": list(BANDS), "image_type": ["science"] * 2}
+    exposures |= {"camera": list(cameras), "band": list(bands), "image_type": ["science"] * 2}
     publish.make_version(
-        lake, Plan(EXPOSURES, {"cameras": list(cameras)}, (Task("all.parquet", {}),)),
+        lake, Plan(EXPOSURES, {"cameras": list(cameras), "bands": list(bands)}, (Task("all.parquet", {}),)),
         lambda root, facts: Output(EXPOSURES.build(exposures)),
     )  # fmt: skip
 
@@ -266,6 +266,14 @@ def test_a_lake_without_depth_names_the_command(lake, models, tmp_path):
     publish_plan(root)
     with pytest.raises(BadInput, match="run truesky depth REQUEST"):
         build_observed.steps(root, asked(models))
+
+
+def test_two_cameras_in_the_band_of_a_model_are_refused(models, tmp_path):
+    publish_catalogue(tmp_path, GALAXIES, 0, 50, 1)
+    publish_catalogue(tmp_path, STARS, 5, 50, 2)
+    publish_plan(tmp_path, ("vis", "nisp"), ("euclid_vis", "euclid_vis"))
+    with pytest.raises(BadInput, match="the plan observes euclid_vis with the cameras nisp and vis"):
+        build_observed.steps(tmp_path, asked(models[:1]))
 
 
 def test_tables_of_an_older_plan_or_catalogue_are_refused(models, tmp_path):

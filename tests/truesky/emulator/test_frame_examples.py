@@ -40,7 +40,8 @@ def made_up(n=120, seed=2, brightest=-5.0):
     return TrueSources(ids, x, y, magnitude, radius), light, image
 
 
-def compared(sources, image):
+def compared(sources, image, **changes):
+    """Return the examples of an image; `changes` are functions that replace columns of the measurements."""
     system = WCS(naxis=2)
     system.wcs.ctype = ["RA---TAN", "DEC--TAN"]
     system.wcs.crval, system.wcs.crpix, system.wcs.cdelt = (
@@ -48,9 +49,10 @@ def compared(sources, image):
         [250.0, 250.0],
         [-SCALE / 3600.0, SCALE / 3600.0],
     )
-    found = catalogue.detect_segments(image, 1e6, 5.0, Limits())
+    measured, segments = catalogue.detect_segments(image, 1e6, 5.0, Limits())
+    measured |= {name: change(measured) for name, change in changes.items()}
     return frame_examples.compare(
-        sources, found, image, {"depth": DEPTH, "psf_area": PSF_AREA}, Geometry(system, SCALE, ZERO)
+        sources, (measured, segments), image, {"depth": DEPTH, "psf_area": PSF_AREA}, Geometry(system, SCALE, ZERO)
     )
 
 
@@ -69,6 +71,23 @@ def test_bright_sources_are_detected_with_their_magnitude_size_and_position():
     assert 0.3 < np.std(offset) < 5.0
     assert np.isnan(outcomes.mag_auto[~outcomes.detected]).all()
     assert (found.examples.features.is_point == (sources.radius[found.rows] == 0.0)).all()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"flux_auto": lambda measured: 0.9 * measured["fluxerr_auto"]},
+        {"flux_aper": lambda measured: 0.9 * measured["fluxerr_aper"]},
+        {"flux_radius": lambda measured: np.full(len(measured["x"]), np.nan)},
+    ],
+)
+def test_detections_with_hardly_any_flux_or_without_a_size_count_as_none(changes):
+    sources, _, image = made_up()
+    assert compared(sources, image).examples.outcomes.detected.sum() > 50
+    found = compared(sources, image, **changes).examples.outcomes
+    assert not found.detected.any()
+    assert np.isnan(found.mag_auto).all()
+    assert (found.flags == 0).all()
 
 
 def test_sources_at_the_edge_without_data_or_too_faint_are_no_examples():

@@ -8,6 +8,7 @@ from lake_schema.ids import source_id
 from lake_schema.tables.survey.observed import observed_sources
 from tests.truesky.emulator import samples
 from truesky.emulator import model, observation
+from truesky.emulator.features import Features
 from truesky.emulator.observation import Conditions, Sources
 
 
@@ -109,3 +110,39 @@ def test_a_detection_with_hardly_any_flux_has_values_that_the_table_allows(tmp_p
         column = next(column for column in allowed.columns if column.name == name)
         assert columns[name].count() > 0
         assert columns[name].max() <= column.hi
+
+
+def drawn_in_two_bands(models, brightness, n=20_000):
+    """Return the outcomes of galaxies of one brightness in two bands with common numbers."""
+    same = Features(np.full(n, brightness), np.full(n, 0.35), np.full(n, -2.0), np.zeros(n, bool))
+    common = tuple(np.random.default_rng(1).standard_normal((2, n)))
+    return [
+        observation.draw_outcomes(one, same, np.random.default_rng(seed), common) for seed, one in enumerate(models, 2)
+    ]
+
+
+@pytest.mark.parametrize(("brightness", "share"), [(-5.0, 0.7), (-3.0, 0.41), (-0.5, 0.12)])
+def test_errors_of_bright_galaxies_are_common_to_two_bands(models, brightness, share):
+    """The sum of the errors of magnitude and size, in the order of the lists, has nearly the correlation of the shares.
+
+    sample: 20,000 sources in two bands, more than 2000 detected in both; significance: 0.04, twice the error, below
+    which a quarter is allowed for the choice between nodes with other lists
+    """
+    first, second = drawn_in_two_bands(models, brightness)
+    both = first.detected & second.detected
+    assert both.sum() > 2000
+    sums = [
+        sum(np.argsort(np.argsort(values[both])) for values in (one.mag_auto, -one.radius)) for one in (first, second)
+    ]
+    assert 0.75 * share - 0.04 < np.corrcoef(*sums)[0, 1] < share + 0.04
+
+
+def test_sources_are_blended_in_both_bands_or_in_none_and_otherwise_detected_independently(models):
+    """sample: 20,000 sources in two bands; significance: 5 errors of the fractions"""
+    first, second = drawn_in_two_bands(models, 0.5)
+    blended = first.blended.mean(), second.blended.mean()
+    assert (first.blended & second.blended).mean() > 3.0 * blended[0] * blended[1]
+    free = ~first.blended & ~second.blended
+    fractions = [one.detected[free].mean() for one in (first, second)]
+    both = (first.detected & second.detected)[free].mean()
+    assert both == pytest.approx(fractions[0] * fractions[1], abs=5.0 * np.sqrt(0.25 / free.sum()))
