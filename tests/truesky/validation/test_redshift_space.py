@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from scripts import two_point_references
 from tests.truesky import nightly
 from truesky.cosmology import FIDUCIAL
 from truesky.validation import pairs, redshift_space, theory
@@ -32,6 +33,17 @@ def test_counts_are_those_of_all_pairs():
     np.testing.assert_array_equal(found.total.reshape(3, 2, angles), wanted)
     np.testing.assert_array_equal(found.jackknife.reshape(4, 3, 2, angles), without)
     assert wanted.sum() > 1000
+
+
+def test_multipoles_are_those_of_treecorr():
+    """TreeCorr counts pairs by both distances, in bins of 1 Mpc/h; ours are bins of separation and angle."""
+    place, kind = two_point_references.clusters_in_space()
+    edges = two_point_references.SEPARATION
+    (mono, quad), _ = redshift_space.measure_multipoles(place, kind, np.zeros(len(kind), int), edges)
+    assert mono == pytest.approx(two_point_references.read_values("xi_0"), rel=0.025, abs=0)
+    assert quad == pytest.approx(two_point_references.read_values("xi_2"), rel=0.0, abs=0.012)
+    assert mono[0] > 0.3
+    assert quad[0] > 0.3
 
 
 def test_correlation_of_matter_agrees_with_its_power_on_large_scales():

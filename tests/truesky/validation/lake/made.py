@@ -81,7 +81,7 @@ def vis_file(path, electrons, rng, shift=(0.0, 0.0), told=GAIN, read=GAIN, noise
         "FILTER": "euclid_vis", "ZEROPNT": zero_point, "SKYRATE": SKY, "DARKRATE": DARK, "DETECTOR": "1-1",
     }  # fmt: skip
     units, place = [image(None, cards)], system(shift)
-    for name, (row, column) in {"E": (1, 0), "F": (1, 1), "G": (0, 1), "H": (0, 0)}.items():
+    for name, (row, column) in {"E": (0, 0), "F": (0, 1), "G": (1, 1), "H": (1, 0)}.items():
         part = electrons[row * SIDE : (row + 1) * SIDE, column * SIDE : (column + 1) * SIDE]
         whole = np.pad(part, ((0, 0), (PRESCAN, OVERSCAN)))
         adu = np.floor(BIAS + np.minimum(whole + noise * rng.standard_normal(whole.shape), FULL) / read + 0.5)

@@ -6,7 +6,8 @@ spectrum compares all bands of multipoles that the field resolves and that are l
 
 Notes
 -----
-Errors are valid for Gaussian fields with the expected power and the measured noise, in the effective area of the mask.
+The means of maps in the mask are subtracted, and the correction for the mask contains this. Errors are valid for
+Gaussian fields with the expected power and noise in the mask; bands are not independent.
 The tolerance of 20 % is for galaxies in the same halo, and for the magnification of galaxies.
 
 References
@@ -23,6 +24,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import pyarrow.compute as pc
 
 from lake_schema import sky
 from lake_schema.arrays import Array, Bool, Float, Int
@@ -32,7 +34,7 @@ from truesky.catalogue.halos import matching
 from truesky.cosmology import Cosmology, from_facts
 from truesky.validation import field as fields
 from truesky.validation import pseudo_power, theory
-from truesky.validation.lake.catalogues.survey_mask import SurveyMask, read_mask, why_outdated
+from truesky.validation.lake.catalogues.survey_mask import SurveyMask, band_of_points, read_mask, why_outdated
 from truesky.validation.lake.measure.frame_context import Result
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
 from truesky.validation.pseudo_power import L_MAX, Bands
@@ -58,7 +60,7 @@ _FIRST, _NARROWEST, _LAST = 20, 20, 400
 _TOLERANCE = 0.2
 # Allowed relative difference of the density of random points.
 _DENSITY_TOLERANCE = 0.01
-# Width of the shells of distance of the expected spectra, Mpc/h, and number of bins of the sources' distances.
+# Approximate width of the shells of distance of the expected spectra, Mpc/h; number of bins of the sources' distances.
 _SHELL, _SOURCE_BINS = 50.0, 20
 # HEALPix nside of the lensing maps below which differences of the convergence count as known failures.
 _NSIDE = 1024
@@ -66,16 +68,18 @@ _NSIDE = 1024
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Map:
-    """A masked map in cells of order 8, its mask, and the spectrum of its noise, which is 0 if not subtracted."""
+    """A masked map in cells of order 8, its mask, and the spectrum of its noise at l = 0 to L_MAX.
+
+    The mean of the values in the mask is 0.
+    """
 
     values: Float
     mask: Float
-    noise: float = 0.0
+    noise: Float
 
-    @property
-    def mask_square(self) -> float:
-        """Return the mean square of the mask on the whole sky."""
-        return float(np.mean(self.mask**2))
+    def product(self, other: _Map) -> float:
+        """Return the mean product of both masks on the whole sky."""
+        return float(np.mean(self.mask * other.mask))
 
 
 def measure(galaxies: read.Version, depth: read.Version, randoms: read.Version) -> Result:
@@ -102,10 +106,11 @@ def measure(galaxies: read.Version, depth: read.Version, randoms: read.Version) 
     field = fields.from_version(galaxies, columns["_healpix_29"])
     cells = np.unique(sky.parent(field.cells, field.order, GENERATION_ORDER)).tolist()
     drawn = randoms.manifest["facts"]
-    mask = read_mask(depth, drawn["band"], cells)
+    mask = read_mask(depth, band_of_points(randoms), cells)
     result = compare(columns, mask, from_facts(facts), int(facts.get("lensing_nside", _NSIDE)))
-    index = randoms.rows(["_healpix_29"])["_healpix_29"].to_numpy()
-    row = _density_row(int(np.count_nonzero(mask.contains(index))), float(drawn["density"]), mask)
+    points = randoms.rows(["_healpix_29"], where=pc.field("band") == mask.band)
+    number = int(np.count_nonzero(mask.contains(points["_healpix_29"].to_numpy())))
+    row = _density_row(number, float(drawn["density"]), mask)
     return Result(Place(), [*result.rows, *row], result.series)
 
 
@@ -135,7 +140,7 @@ def compare(columns: Mapping[str, Array], mask: SurveyMask, cosmology: Cosmology
     columns = {name: values[used] for name, values in columns.items()}
     edges = _band_edges(mask.area)
     convergence, why = _convergence_map(columns, mask)
-    rows, series, galaxy_bands = [], {}, None
+    rows, series, galaxy_bands, cross_bands = [], {}, None, None
     for low, high in pairwise(Z_EDGES):
         sample = (columns["z_true"] > low) & (columns["z_true"] < high)
         first, last = int(edges[1]), _last_multipole(low, high, cosmology)
@@ -145,19 +150,22 @@ def compare(columns: Mapping[str, Array], mask: SurveyMask, cosmology: Cosmology
             names = (f"galaxies_{low:g}", f"convergence_{low:g}")
             rows += [not_applicable(NAME, Place(), f"{reason} at {low:g} < z < {high:g}", SOURCE, n) for n in names]
             continue
-        density, tracers = _density_map(columns, sample, mask), _tracers(columns, sample, cosmology)
-        galaxy_bands = galaxy_bands or pseudo_power.bands(density.mask, density.mask, edges)
-        auto, band_values = _auto_power(density, tracers, galaxy_bands, cosmology)
+        density, tracers = _density_map(columns, sample, mask), _tracers(columns, sample, (low, high), cosmology)
+        galaxy_bands = galaxy_bands or _bands(density, density, edges)
+        power, band_values, covariance = _auto_power(density, tracers, galaxy_bands, cosmology)
         note = f"{np.count_nonzero(sample)} galaxies, {mask.area:.3g} deg2 of {mask.band}"
-        rows.append(_row(f"galaxies_{low:g}", band_values[:, inside], note))
+        rows.append(_row(f"galaxies_{low:g}", band_values[:, inside], covariance[np.ix_(inside, inside)], note))
         series[f"power_{low:g}"] = band_values[:, inside]
         if convergence is None:
             rows.append(not_applicable(NAME, Place(), why, SOURCE, f"convergence_{low:g}"))
             continue
-        band_values = _cross_power(
-            density, convergence, (tracers, _sources(columns, cosmology)), (auto, galaxy_bands), cosmology
-        )
-        rows.append(_row(f"convergence_{low:g}", band_values[:, inside], note, nside))
+        if cross_bands is None:
+            are_equal = np.array_equal(density.mask, convergence.mask)
+            cross_bands = galaxy_bands if are_equal else _bands(density, convergence, edges)
+        samples = tracers, _sources(columns, cosmology)
+        band_values, covariance = _cross_power(density, convergence, samples, (power, cross_bands), cosmology)
+        covariance = covariance[np.ix_(inside, inside)]
+        rows.append(_row(f"convergence_{low:g}", band_values[:, inside], covariance, note, nside))
         series[f"convergence_power_{low:g}"] = band_values[:, inside]
     return Result(Place(), rows, series)
 
@@ -168,6 +176,11 @@ def _band_edges(area: float) -> Int:
     first, width = max(_FIRST, int(360.0 / side)), max(_NARROWEST, int(180.0 / side))
     inner = np.arange(first, L_MAX + 2 - width, width)
     return np.unique(np.concatenate([[2], inner[inner <= L_MAX], [L_MAX + 1]])).astype(np.int64)
+
+
+def _bands(first: _Map, second: _Map, edges: Int) -> Bands:
+    """Return the bands of the cross spectra of two maps whose means were subtracted."""
+    return pseudo_power.bands(first.mask, second.mask, edges, is_centred=True)
 
 
 def _last_multipole(low: float, high: float, cosmology: Cosmology) -> int:
@@ -193,7 +206,10 @@ def _density_map(columns: Mapping[str, Array], sample: Bool, mask: SurveyMask) -
     overdensity = np.bincount(at, minlength=len(cells)) / mean - weight
     solid_angle = np.radians(1.0) ** 2 * sky.cell_area(GENERATION_ORDER)
     noise = solid_angle**2 * len(at) / mean**2 / (4.0 * np.pi)
-    return _Map(pseudo_power.map_of_cells(cells, overdensity), pseudo_power.map_of_cells(cells, weight), noise)
+    full_mask = pseudo_power.map_of_cells(cells, weight)
+    # The number of all galaxies is fixed, so that the map has no noise at l = 0, and less on the scale of the field.
+    window = pseudo_power.power_of_maps(full_mask) * 4.0 * np.pi / (solid_angle * weight.sum()) ** 2
+    return _Map(pseudo_power.map_of_cells(cells, overdensity), full_mask, noise * (1.0 - window))
 
 
 def _is_source(columns: Mapping[str, Array]) -> Bool:
@@ -215,15 +231,22 @@ def _convergence_map(columns: Mapping[str, Array], mask: SurveyMask) -> tuple[_M
     weight = np.where(number > 0, weight, 0.0)
     mean = np.bincount(at, kappa, len(cells)) / np.maximum(number, 1)
     values = weight * (mean - np.sum(weight * mean) / weight.sum())
-    return _Map(pseudo_power.map_of_cells(cells, values), pseudo_power.map_of_cells(cells, weight)), ""
+    # Scatter of the convergence in a cell, which the mean of its galaxies has, too.
+    variance = np.maximum(np.bincount(at, kappa**2, len(cells)) / np.maximum(number, 1) - mean**2, 0.0)
+    solid_angle = np.radians(1.0) ** 2 * sky.cell_area(GENERATION_ORDER)
+    noise = solid_angle**2 / (4.0 * np.pi) * float(np.sum(weight**2 * variance / np.maximum(number, 1)))
+    full_map, full_mask = (pseudo_power.map_of_cells(cells, part) for part in (values, weight))
+    return _Map(full_map, full_mask, np.full(L_MAX + 1, noise)), ""
 
 
-def _tracers(columns: Mapping[str, Array], sample: Bool, cosmology: Cosmology) -> Shells:
-    """Return the distribution of galaxies over distance, weighted with the bias of their halos."""
+def _tracers(columns: Mapping[str, Array], sample: Bool, limits: tuple[float, float], cosmology: Cosmology) -> Shells:
+    """Return the distribution of galaxies between two redshifts over distance, weighted with the halos' bias."""
     has_halo = sample & np.isfinite(columns["log_halo_mass"])
     z, mass = (columns[name][has_halo].astype(float) for name in ("z_true", "log_halo_mass"))
     chi, halos = np.asarray(cosmology.comoving_distance(z)), matching.masses(cosmology)
-    edges = np.arange(chi.min() * 0.999, chi.max() + _SHELL, _SHELL)
+    # Equal shells that end at the limits of the sample: a shell that it fills in part would have a wrong density.
+    low, high = (float(cosmology.comoving_distance(limit)) for limit in limits)
+    edges = np.linspace(low, high, max(round((high - low) / _SHELL), 1) + 1)
     return theory.shells(chi, halos.interpolate_pairs(halos.bias, z, mass), edges)
 
 
@@ -234,41 +257,39 @@ def _sources(columns: Mapping[str, Array], cosmology: Cosmology) -> tuple[Float,
     return 0.5 * (edges[1:] + edges[:-1]), number.astype(float)
 
 
-def _auto_power(density: _Map, tracers: Shells, galaxy_bands: Bands, cosmology: Cosmology) -> tuple[Float, Float]:
-    """Return the expected C_l + noise of the map, and rows with l, C_l, its error and its expected value by band."""
+def _auto_power(density: _Map, tracers: Shells, bands: Bands, cosmology: Cosmology) -> tuple[Float, Float, Float]:
+    """Return the expected C_l, rows with l, C_l, its error and its expected value by band, and the covariance."""
     c_l = _at_all_multipoles(lambda ell: theory.galaxy_power(cosmology, ell, tracers))
-    value = galaxy_bands.measure(pseudo_power.power_of_maps(density.values) - density.noise)
-    total = c_l + density.noise / density.mask_square
-    expected = galaxy_bands.expect(c_l)
-    error = np.sqrt(2.0 / _modes(galaxy_bands, density, density)) * galaxy_bands.expect(total)
-    return total, np.stack([galaxy_bands.middle, value, error, expected])
+    value = bands.measure(pseudo_power.power_of_maps(density.values) - density.noise)
+    total = _in_mask(density, bands, c_l)
+    covariance = bands.covariance(total, total, total)
+    return c_l, np.stack([bands.middle, value, np.sqrt(np.diag(covariance)), bands.expect(c_l)]), covariance
 
 
 def _cross_power(
     density: _Map,
     convergence: _Map,
     samples: tuple[Shells, tuple[Float, Float]],
-    auto: tuple[Float, Bands],
+    theory_and_bands: tuple[Float, Bands],
     cosmology: Cosmology,
-) -> Float:
-    """Return rows with l, cross power, its error and its expected value by band."""
+) -> tuple[Float, Float]:
+    """Return rows with l, cross power, its error and its expected value by band, and the covariance."""
     tracers, (chi, number) = samples
-    total, galaxy_bands = auto
-    cross_bands = galaxy_bands
-    if not np.array_equal(density.mask, convergence.mask):
-        cross_bands = pseudo_power.bands(density.mask, convergence.mask, galaxy_bands.edges)
+    galaxies, bands = theory_and_bands
     c_l = _at_all_multipoles(lambda ell: theory.galaxy_convergence_power(cosmology, ell, tracers, chi, number))
-    value = cross_bands.measure(pseudo_power.power_of_maps(density.values, convergence.values))
-    noise = (
-        galaxy_bands.measure(pseudo_power.power_of_maps(convergence.values))
-        * density.mask_square
-        / convergence.mask_square
-    )
-    expected = cross_bands.expect(c_l)
-    variance = np.maximum(noise, 0.0) * galaxy_bands.expect(total) + expected**2
-    return np.stack(
-        [cross_bands.middle, value, np.sqrt(variance / _modes(cross_bands, density, convergence)), expected]
-    )
+    lensing = _at_all_multipoles(lambda ell: theory.convergence_power(cosmology, ell, chi, number))
+    # Errors follow from the expected power of the convergence: with the measured one, fields with little structure
+    # would have more weight, and the mean of the factors would be too small.
+    spectra = _in_mask(density, bands, galaxies), _in_mask(convergence, bands, lensing)
+    covariance = bands.covariance(*spectra, bands.mix(c_l) / density.product(convergence))
+    value = bands.measure(pseudo_power.power_of_maps(density.values, convergence.values))
+    return np.stack([bands.middle, value, np.sqrt(np.diag(covariance)), bands.expect(c_l)]), covariance
+
+
+def _in_mask(masked: _Map, bands: Bands, c_l: Float) -> Float:
+    """Return the mean spectrum of a map with its noise in each band, as it is in the mask."""
+    noise = np.add.reduceat(masked.noise, bands.edges[:-1]) / np.diff(bands.edges)
+    return np.asarray((bands.mix(c_l) + noise) / masked.product(masked))
 
 
 def _at_all_multipoles(power: Callable[[Float], Float]) -> Float:
@@ -278,18 +299,12 @@ def _at_all_multipoles(power: Callable[[Float], Float]) -> Float:
     return np.asarray(c_l * pseudo_power.pixel_window() ** 2)
 
 
-def _modes(bands: Bands, first: _Map, second: _Map) -> Float:
-    """Return the effective number of independent modes of each band."""
-    number = bands.edges[1:].astype(float) ** 2 - bands.edges[:-1].astype(float) ** 2
-    product = first.mask * second.mask
-    return np.asarray(number * np.mean(product) ** 2 / np.mean(product**2))
-
-
-def _row(name: str, band_values: Float, note: str, nside: int = _NSIDE) -> Row:
+def _row(name: str, band_values: Float, covariance: Float, note: str, nside: int = _NSIDE) -> Row:
     """Return the row of the factor between measured and expected power, averaged over bands by their errors."""
     ell, value, error, expected = band_values
-    weight = np.sum((expected / error) ** 2)
-    factor, factor_error = float(np.sum(value * expected / error**2) / weight), float(weight**-0.5)
+    share = expected / error**2 / np.sum((expected / error) ** 2)
+    factor = float(np.sum(share * value))
+    factor_error = float(np.sqrt(np.sum(share[:, None] * share * covariance)))
     rough = f"lensing maps contain structure only to l = {nside}" if nside < _NSIDE else ""
     full_note = f"{note}, {len(ell)} bands with l = {ell[0]:.0f} to {ell[-1]:.0f}"
     return Row(NAME, name, Place(), factor, factor_error, 1.0, _TOLERANCE, "", SOURCE, note=full_note,

@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import pyarrow.compute as pc
 
 from lake_schema import sky
 from lake_schema.arrays import Array, Float, Int
@@ -27,7 +28,7 @@ from truesky.randomness.rng import stream
 from truesky.validation import field as fields
 from truesky.validation import pairs, redshift_space
 from truesky.validation.field import Field
-from truesky.validation.lake.catalogues.survey_mask import SurveyMask, read_mask, why_outdated
+from truesky.validation.lake.catalogues.survey_mask import SurveyMask, band_of_points, read_mask, why_outdated
 from truesky.validation.lake.measure.frame_context import Result
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
 
@@ -81,11 +82,12 @@ def measure(galaxies: read.Version, depth: read.Version, randoms: read.Version) 
         return _no_result(f"table galaxies has no column {', '.join(missing)}")
     if why := why_outdated(depth, randoms):
         return _no_result(why)
-    table, points = galaxies.rows(list(COLUMNS)), randoms.rows(list(RANDOM_COLUMNS))
+    table, band = galaxies.rows(list(COLUMNS)), band_of_points(randoms)
+    points = randoms.rows(list(RANDOM_COLUMNS), where=pc.field("band") == band)
     columns = {name: table[name].to_numpy() for name in COLUMNS}
     field = fields.from_version(galaxies, columns["_healpix_29"])
     cells = np.unique(sky.parent(field.cells, field.order, GENERATION_ORDER)).tolist()
-    mask = read_mask(depth, randoms.manifest["facts"]["band"], cells)
+    mask = read_mask(depth, band, cells)
     scattered = {name: points[name].to_numpy() for name in RANDOM_COLUMNS}
     return compare(columns, scattered, mask, from_facts(galaxies.manifest.get("facts", {})))
 

@@ -63,6 +63,11 @@ def why_outdated(depth: read.Version, randoms: read.Version) -> str:
     return "table randoms was drawn in another version of table depth: run truesky randoms again"
 
 
+def band_of_points(randoms: read.Version) -> str:
+    """Return the band whose points are used, the first one with which the table `randoms` was drawn."""
+    return str(randoms.manifest["facts"]["bands"][0])
+
+
 def read_mask(depth: read.Version, band: str, simulated_cells: Sequence[int]) -> SurveyMask:
     """Read the mask of a band in those order-8 cells in which galaxies were simulated.
 

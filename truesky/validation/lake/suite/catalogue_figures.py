@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from lake_schema.arrays import Float
+from truesky.validation.lake.catalogues import angular_power
 from truesky.validation.lake.measure.rows import Row
 
 # Colour of most points and lines.
@@ -181,12 +183,17 @@ def _plot_power(series: Mapping[str, Any], names: Sequence[str]) -> Figure:
     for axis, start, label in zip(
         axes, ("power_", "convergence_power_"), ("C$_l$ of galaxies", "C$_l$ with convergence"), strict=True
     ):
-        for number, name in enumerate(name for name in names if name.startswith(start)):
-            ell, value, error, expected = series[name]
-            color = f"C{number}"
-            _plot_points(axis, ell, value, error, color, f"z > {name.removeprefix(start)}")
-            axis.plot(ell, expected, "-", lw=1, color=color)
-        axis.set(xscale="log", yscale="log", xlabel="l", ylabel=label)
+        axis.axhline(1.0, lw=0.8, color="k")
+        for number, (low, high) in enumerate(pairwise(angular_power.Z_EDGES)):
+            if (name := f"{start}{low:g}") in names:
+                ell, value, error, expected = series[name]
+                # Redshift bins have the same bands: move their points apart.
+                ell = ell + (2.0 * number - 3.0)
+                axis.errorbar(
+                    ell, value / expected, error / expected, fmt="o", ms=4, color=f"C{number}", capsize=2,
+                    label=f"{low:g} < z < {high:g}",
+                )  # fmt: skip
+        axis.set(xlabel="l", ylabel=f"{label} / theory")
         axis.legend()
     return figure
 

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
@@ -9,6 +11,7 @@ from lake_schema.lazy_healpy import healpy as hp
 from lake_schema.store import layout, publish, read
 from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.survey.randoms import RANDOMS
+from scripts import two_point_references
 from tests.truesky.survey_maps import depths
 from tests.truesky.validation.lake.catalogues.test_faults import Version
 from truesky.cosmology import FIDUCIAL
@@ -45,7 +48,7 @@ def galaxies_in_bins():
         "kind": np.zeros(300_000, np.int8), "z_true": rng.uniform(0.4, 0.6, 300_000),
         "log_halo_mass": np.full(300_000, 12.5), "mag_r01": np.full(300_000, 20.0), "kappa": np.zeros(300_000),
     }  # fmt: skip
-    tracers = angular_power._tracers(columns, np.ones(300_000, bool), FIDUCIAL)
+    tracers = angular_power._tracers(columns, np.ones(300_000, bool), (0.4, 0.6), FIDUCIAL)
     source = np.asarray(FIDUCIAL.comoving_distance(np.array([1.3]))), np.ones(1)
     powers = (
         lambda ell: theory.galaxy_power(FIDUCIAL, ell, tracers),
@@ -81,7 +84,7 @@ def _pair(c_l):
 def publish_randoms(lake, cells, rows, **facts):
     """Publish random points with a density of 10 per arcmin2 in neighbouring cells, and return their version."""
     task = Task(layout.cell_file(5, int(cells[0]) >> 6), {})
-    plan = Plan(RANDOMS, {"density": 10.0, "band": "euclid_vis", **facts}, (task,))
+    plan = Plan(RANDOMS, {"density": 10.0, "bands": ["euclid_vis"], **facts}, (task,))
     publish.make_version(lake, plan, lambda lake, facts: Output(rows))
     return read.version(lake, "randoms", plan.key)
 
@@ -189,35 +192,28 @@ def test_density_of_random_points():
     assert row.verdict == FAIL
 
 
-def test_spectra_are_those_of_pyccl():
-    """The matter power of truesky is given to pyccl, so that only the projections are compared."""
-    ccl = pytest.importorskip("pyccl")
-    z = np.linspace(0.4, 0.6, 401)
+def test_spectra_are_those_of_ccl():
+    """The matter power of truesky was given to CCL, so that only the projections are compared."""
+    z, _ = two_point_references.lens_sample()
     columns = {"z_true": z, "log_halo_mass": np.full(len(z), 12.5)}
-    tracers = angular_power._tracers(columns, np.ones(len(z), bool), FIDUCIAL)
-    ell, k = np.array([50.0, 100.0, 200.0, 400.0]), np.geomspace(1e-4, 30.0, 500)
-    a = 1.0 / (1.0 + np.linspace(0.0, 2.0, 41)[::-1])
-    h = FIDUCIAL.h
-    power = np.array([theory.matter_power(FIDUCIAL, k, 1.0 / one - 1.0) for one in a])
-    other = ccl.Cosmology(
-        Omega_c=FIDUCIAL.omega_m - FIDUCIAL.omega_b, Omega_b=FIDUCIAL.omega_b, h=h, sigma8=FIDUCIAL.sigma_8,
-        n_s=FIDUCIAL.n_s, transfer_function="eisenstein_hu", Omega_g=0.0, Neff=0.0,
-    )  # fmt: skip
-    surface = ccl.Pk2D(a_arr=a, lk_arr=np.log(k * h), pk_arr=np.log(power / h**3), is_logp=True)
-    grid = np.linspace(0.3, 0.7, 800)
-    inside = ((grid > 0.4) & (grid < 0.6)).astype(float)
-    bias = np.interp(grid, z, angular_power.matching.masses(FIDUCIAL).interpolate_pairs(
-        angular_power.matching.masses(FIDUCIAL).bias, z, columns["log_halo_mass"]))  # fmt: skip
-    galaxies = ccl.NumberCountsTracer(other, has_rsd=False, dndz=(grid, inside), bias=(grid, bias))
-    far = np.linspace(1.29, 1.31, 200)
-    lensed = ccl.WeakLensingTracer(other, dndz=(far, np.ones(200)))
-    source = np.asarray(FIDUCIAL.comoving_distance(np.array([1.3]))), np.ones(1)
-    for wanted, found in (
-        (ccl.angular_cl(other, galaxies, galaxies, ell, p_of_k_a=surface), theory.galaxy_power(FIDUCIAL, ell, tracers)),
-        (
-            # pyccl has the prefactor of shear, sqrt((l + 2)! / (l - 2)!) / (l + 1/2)^2, where convergence has 1.
-            ccl.angular_cl(other, galaxies, lensed, ell, p_of_k_a=surface),
-            theory.galaxy_convergence_power(FIDUCIAL, ell, tracers, *source),
-        ),
+    tracers = angular_power._tracers(columns, np.ones(len(z), bool), two_point_references.LENSES, FIDUCIAL)
+    source = np.asarray(FIDUCIAL.comoving_distance(np.array([two_point_references.SOURCE]))), np.ones(1)
+    ell = two_point_references.ELL
+    for name, found in (
+        ("galaxy_power", theory.galaxy_power(FIDUCIAL, ell, tracers)),
+        ("galaxy_convergence_power", theory.galaxy_convergence_power(FIDUCIAL, ell, tracers, *source)),
     ):
-        np.testing.assert_allclose(found, wanted, rtol=0.02)
+        np.testing.assert_allclose(found, two_point_references.read_values(name), rtol=0.01, err_msg=name)
+
+
+@given(st.floats(0.1, 1.0), st.floats(0.05, 0.5))
+@settings(max_examples=10, deadline=None)
+def test_shells_end_at_the_limits_of_the_sample(low, width):
+    """Galaxies of constant density and bias fill all shells: the first and the last have no smaller weight."""
+    chi = np.linspace(*(float(FIDUCIAL.comoving_distance(z)) for z in (low, low + width)), 4001)[1:-1]
+    columns = {"z_true": FIDUCIAL.redshift(chi), "log_halo_mass": np.full(len(chi), 12.5)}
+    tracers = angular_power._tracers(columns, np.ones(len(chi), bool), (low, low + width), FIDUCIAL)
+    halos = angular_power.matching.masses(FIDUCIAL)
+    bias = halos.interpolate_pairs(halos.bias, columns["z_true"], columns["log_halo_mass"])
+    share = tracers.weight / np.interp(tracers.chi, chi, bias) * (chi[-1] - chi[0])
+    np.testing.assert_allclose(share, 1.0, atol=0.02)

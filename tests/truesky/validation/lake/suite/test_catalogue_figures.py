@@ -55,3 +55,18 @@ def test_report_contains_figures(series):
     text = report.page("lake", LakeResults(ROWS, [], [Result(Place(), ROWS, series)]))
     assert text.count("src='data:image/png;base64,") == 5
     assert "non-linear theory" in text
+
+
+def test_power_is_plotted_relative_to_theory():
+    """Points of the redshift bins are beside each other, and each has its error."""
+    ell, expected = np.array([100.0, 200.0]), np.array([4e-6, 1e-6])
+    one = np.stack([ell, [8e-6, -1e-6], [1e-6, 2e-6], expected])
+    series = {name: one for name in ("power_0.4", "power_0.6", "convergence_power_0.4", "convergence_power_0.6")}
+    ((caption, figure),) = catalogue_figures.draw_all([], series)
+    assert "Errors are those of Gaussian fields" in caption
+    for axis in figure.axes:
+        assert [text.get_text() for text in axis.get_legend().get_texts()] == ["0.4 < z < 0.6", "0.6 < z < 0.8"]
+        points = [container.lines[0].get_xydata() for container in axis.containers]
+        assert np.allclose([values[:, 1] for values in points], [2.0, -1.0], atol=1e-9)
+        assert np.abs(points[0][:, 0] - points[1][:, 0]).min() > 1.0
+        assert max(np.abs(values[:, 0] - ell).max() for values in points) < 4.0

@@ -20,7 +20,7 @@ from tests.truesky.validation.lake.images import (
 )
 from tests.truesky.validation.lake.images import test_faults as images
 from tests.truesky.validation.model import test_observed
-from truesky.validation.lake.suite import checks
+from truesky.validation.lake.suite import checks, inventory
 from truesky.validation.verdicts import FAIL
 
 # Test and fault by check.
@@ -70,6 +70,10 @@ def names():
 def test_no_check_without_a_fault():
     assert set(names()) == set(FAULTS)
     assert all(check.source for check in (*checks.FRAME_CHECKS, *checks.EXPOSURE_CHECKS, *checks.CATALOGUE_CHECKS))
+
+
+def test_the_tables_of_all_checks_are_opened():
+    assert {name for check in checks.CATALOGUE_CHECKS for name in check.tables} <= set(inventory.TABLES)
 
 
 @pytest.mark.parametrize("name", FAULTS)
