@@ -295,7 +295,10 @@ def calibrated_electrons(path, header):
             raw = scene.layout.split(np.asarray(read_back.frame(path).data))
         else:
             raw = np.stack(
-                [quadrants.to_detector_axes(unit.data.astype(np.uint16), i) for i, unit in enumerate(units[1:])]
+                [
+                    quadrants.to_detector_axes(units[f"{header['DETECTOR']}.{name}"].data.astype(np.uint16), i)
+                    for i, name in enumerate(quadrants.NAMES)
+                ]
             )
     return calibrated.electrons(raw, scene, int(header["SEED"]), applied(header))
 

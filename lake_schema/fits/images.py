@@ -118,8 +118,8 @@ def write_images(path: Path, images: Sequence[Image], rice: bool = False) -> Non
 
     if not images:
         raise BadInput(f"{path}: a FITS file must have at least one image")
-    make_hdu = [_compressed_hdu if rice and _has_integers(image) else image_hdu for image in images]
-    if make_hdu[0] is _compressed_hdu:
+    make_hdu = [compressed_hdu if rice and _has_integers(image) else image_hdu for image in images]
+    if make_hdu[0] is compressed_hdu:
         first, remaining = [fits.PrimaryHDU()], zip(make_hdu, images, strict=True)
     else:
         first, remaining = [primary_hdu(images[0])], zip(make_hdu[1:], images[1:], strict=True)
@@ -227,7 +227,8 @@ def image_hdu(image: Image) -> fits.ImageHDU:
     return _add_cards(fits.ImageHDU(data=None if image.data is None else _check_array(image.data)), image)
 
 
-def _compressed_hdu(image: Image) -> fits.BinTableHDU:
+def compressed_hdu(image: Image) -> fits.BinTableHDU:
+    """Return an image of integers as the binary table in which FITS stores it with the compression RICE_1."""
     from astropy.io import fits
 
     data = _check_array(np.asarray(image.data))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import ChainMap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,10 @@ _INHERIT: tuple[Card, ...] = (("INHERIT", True, "primary header also applies"),)
 
 # Function that returns further cards of an extension from its name and from the values of its header.
 ArrayCards = Callable[[str, Mapping[str, Any]], Sequence[Card]]
+
+
+# Function that returns the image that is stored instead of a given one.
+ArrayChange = Callable[[Image], Image]
 
 
 def no_cards(name: str, header: Mapping[str, Any]) -> Sequence[Card]:
@@ -42,6 +46,7 @@ def join(
     extra_cards: Sequence[Card],
     kept_keywords: Sequence[str] = (),
     array_cards: ArrayCards = no_cards,
+    changes: Mapping[str, ArrayChange] | None = None,
 ) -> None:
     """Write the images of several FITS files as extensions to one file, which replaces `path` in one rename.
 
@@ -61,6 +66,9 @@ def join(
     array_cards : callable, optional
         Function of the name of an extension and of the values in its header and in the primary header, which returns
         further cards of the extension. Cards with keywords that its header has are left out.
+    changes : mapping of str to callable, optional
+        Functions of an image, by the name of a file: the images of these files are replaced by the results, before
+        `array_cards` is called. A compressed image is compressed again.
 
     Raises
     ------
@@ -82,11 +90,22 @@ def join(
     ]
     keywords = _Keywords({card[0] for card in common}, set(kept_keywords))
     cards = [*common, *(card for card in extra_cards if card[0] not in keywords.common)]
-    write.write_one_by_one(path, _joined_hdus(files, cards, keywords, array_cards))
+    write.write_one_by_one(path, _joined_hdus(files, cards, keywords, array_cards, changes or {}))
+
+
+def array_sizes(file: Path) -> list[tuple[int, int]]:
+    """Return the numbers of columns and rows of each image in a file that `write_images` wrote, from its headers."""
+    with write.open_written(file) as hdus:
+        prefixes = ((hdu.header, "Z" * write.is_compressed(hdu)) for hdu in _arrays(hdus))
+        return [(header[f"{prefix}NAXIS1"], header[f"{prefix}NAXIS2"]) for header, prefix in prefixes]
 
 
 def _joined_hdus(
-    files: Sequence[tuple[str, Path]], cards: Sequence[Card], keywords: _Keywords, array_cards: ArrayCards
+    files: Sequence[tuple[str, Path]],
+    cards: Sequence[Card],
+    keywords: _Keywords,
+    array_cards: ArrayCards,
+    changes: Mapping[str, ArrayChange],
 ) -> Iterator[Any]:
 
     yield images.primary_hdu(Image(None, tuple(cards)))
@@ -94,16 +113,28 @@ def _joined_hdus(
     for name, file in files:
         with write.open_written(file) as hdus:
             first_hdu = hdus[0]
-            for hdu in hdus:
-                is_image = hdu.header["NAXIS"] and not write.is_compressed(hdu)
-                make_extension = _image_extension if is_image else _compressed_extension
-                if is_image or write.is_compressed(hdu):
-                    extension = make_extension(hdu, name, keywords.common, keywords.repeated, first_hdu)
-                    header_values = ChainMap(extension.header, common_values)
-                    for card in array_cards(extension.header["EXTNAME"], header_values):
-                        if card[0] not in extension.header:
-                            extension.header.append(card, end=True)
-                    yield extension
+            arrays = _changed_arrays(file, changes[name]) if name in changes else _arrays(hdus)
+            for hdu in arrays:
+                make_extension = _compressed_extension if write.is_compressed(hdu) else _image_extension
+                extension = make_extension(hdu, name, keywords.common, keywords.repeated, first_hdu)
+                header_values = ChainMap(extension.header, common_values)
+                for card in array_cards(extension.header["EXTNAME"], header_values):
+                    if card[0] not in extension.header:
+                        extension.header.append(card, end=True)
+                yield extension
+
+
+def _arrays(hdus: Iterable[Any]) -> list[Any]:
+    return [hdu for hdu in hdus if write.is_compressed(hdu) or hdu.header["NAXIS"]]
+
+
+def _changed_arrays(file: Path, change: ArrayChange) -> Iterator[Any]:
+    """Yield the arrays of a file after a change, compressed as in the file."""
+    with write.open_written(file) as hdus:
+        are_compressed = [write.is_compressed(hdu) for hdu in _arrays(hdus)]
+    arrays = [image for image in images.read_images(file) if image.data is not None]
+    for is_compressed, image in zip(are_compressed, arrays, strict=True):
+        yield (images.compressed_hdu if is_compressed else images.image_hdu)(change(image))
 
 
 def _image_extension(hdu: Any, name: str, common_keywords: set[str], kept_keywords: set[str], first_hdu: Any) -> Any:

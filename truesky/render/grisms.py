@@ -1,26 +1,21 @@
 """Write the traces and sensitivities of the grisms as configuration files for grismconf and slitlessutils.
 
-    python -m truesky.render.grisms [LAKE --exposure N [--name REQUEST]] --out FOLDER [--detectors DET11 ..]
-
-The command writes a file such as FOLDER/RGS000_DET11.conf for every grism and detector, and next to it a table with the
-sensitivity of each spectral order. By default the values come from the mission database, and the grism wheel has no
-error. With LAKE and --exposure, the values are the ones with which the spectra of this exposure were drawn, and names
-are such as FOLDER/RGS000_000012_DET11.conf.
+A configuration is a file such as RGS000_DET11.conf for a grism and a detector, and next to it a table with the
+sensitivity of each spectral order. The values come from the mission database, without an error of the grism wheel, or
+are the ones with which the spectra of a rendered exposure were drawn; files then have names such as
+RGS000_000012_DET11.conf.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lake_schema import command, user_files
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration, resolve
-from lake_schema.store import layout, read
+from lake_schema.store import read
 from lake_schema.units import LIGHT_ANGSTROM_S, UJY_CGS
-from truesky.command_line.parser import Parser
 from truesky.fluxes import passbands
 from truesky.render import detector_inputs
 from truesky.render.camera import detectors
@@ -122,55 +117,60 @@ def aims_of_exposure(
         yield part["detector"], aim, variant.mission, facts["request"]["seed"]
 
 
-def _configurations(options: argparse.Namespace) -> Iterator[tuple[str, Aim, MissionConfiguration, int]]:
-    """Yield for each configuration file: name without ending, detector with exposure, mission parameters, and seed.
+def write(
+    folder: Path,
+    lake: Path | None = None,
+    exposure: int | None = None,
+    detector_names: Sequence[str] = (),
+    request: str | None = None,
+) -> int:
+    """Write the configurations of all grisms, or of a rendered exposure, and return their number.
 
-    `options` are the arguments of the command. They select the detectors of a rendered exposure, or all grisms.
+    Parameters
+    ----------
+    folder : Path
+        Folder to write to, which is created if needed. Files with the same names are replaced.
+    lake : Path, optional
+        Folder of a lake with rendered spectra; None for the nominal values of all grisms.
+    exposure : int, optional
+        Number of the exposure in the lake; required with a lake.
+    detector_names : sequence of str, optional
+        Names of the detectors; by default all.
+    request : str, optional
+        Name of the request; required if the lake has several.
+
+    Returns
+    -------
+    int
+        Number of configurations.
+
+    Raises
+    ------
+    BadInput
+        If a detector does not exist or has not been rendered, or the exposure has no spectra. Nothing is written then.
     """
-    if options.lake:
-        for name, aim, mission, seed in aims_of_exposure(
-            layout.resolve_lake(options.lake), options.exposure, options.name
-        ):
-            if not options.detectors or name in options.detectors:
-                yield f"{aim.exposure.grism}_{options.exposure:06d}_{name}", aim, mission, seed
-        return
-    for grism in sorted(grism for names in planned_exposures.GRISMS.values() for grism in names):
-        camera = planned_exposures.untilted_exposure(grism, resolve()).camera
-        mission = resolve(overrides={f"{camera}.grism_wheel_error": (0.0, "deg")})
-        for name in options.detectors or [detector.name for detector in detectors.detectors(camera, mission)]:
-            yield f"{grism}_{name}", nominal_aim(grism, name, mission), mission, 0
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command: write the configuration files and print their number. Return the exit status."""
-    parser = Parser(prog="python -m truesky.render.grisms", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder to write to; it is created if needed")
-    parser.add_lake("folder of a lake with rendered spectra", is_optional=True)
-    parser.add_argument("--exposure", type=int, help="number of the exposure in the lake")
-    parser.add_argument("--name", help="name of the request, required if the lake has several")
-    parser.add_argument("--detectors", nargs="+", metavar="NAME", help="only these detectors")
-    options = parser.parse_args(argv)
-    return command.run("grisms", lambda: _write_configurations(options))
-
-
-def _write_configurations(options: argparse.Namespace) -> int:
-    if bool(options.lake) != (options.exposure is not None):
-        raise BadInput("LAKE and --exposure must be given together")
-    if options.name and not options.lake:
-        raise BadInput("--name requires LAKE")
-    folder = user_files.check_folder(options.out)
     # Make the whole list first, so that nothing is written if one configuration is invalid.
-    configurations = list(_configurations(options))
-    missing = set(options.detectors or ()) - {aim.detector.name for _, aim, _, _ in configurations}
-    if missing:
-        raise BadInput(f"exposure {options.exposure}: detector {min(missing)} has not been rendered")
+    if lake is None or exposure is None:
+        configurations = list(_nominal_configurations(detector_names))
+    else:
+        configurations = [
+            (f"{aim.exposure.grism}_{exposure:06d}_{name}", aim, mission, seed)
+            for name, aim, mission, seed in aims_of_exposure(lake, exposure, request)
+            if not detector_names or name in detector_names
+        ]
+    if missing := set(detector_names) - {aim.detector.name for _, aim, _, _ in configurations}:
+        raise BadInput(f"exposure {exposure}: detector {min(missing)} has not been rendered")
     folder.mkdir(parents=True, exist_ok=True)
     for name, aim, mission, seed in configurations:
         shape = aim.detector.ny, aim.detector.nx
         grism_files.write(folder, name, orders(aim, mission, seed), shape)
-    print(f"{options.out}: {len(configurations)} configurations")
-    return 0
+    return len(configurations)
 
 
-if __name__ == "__main__":
-    command.exit_with_status(main)
+def _nominal_configurations(detector_names: Sequence[str]) -> Iterator[tuple[str, Aim, MissionConfiguration, int]]:
+    """Yield for each grism and detector: name without ending, detector with exposure, mission parameters, and seed."""
+    for grism in sorted(grism for names in planned_exposures.GRISMS.values() for grism in names):
+        camera = planned_exposures.untilted_exposure(grism, resolve()).camera
+        mission = resolve(overrides={f"{camera}.grism_wheel_error": (0.0, "deg")})
+        for name in detector_names or [detector.name for detector in detectors.detectors(camera, mission)]:
+            yield f"{grism}_{name}", nominal_aim(grism, name, mission), mission, 0

@@ -47,7 +47,7 @@ def test_the_most_specific_value_is_used(given, detector):
             (given[where] for where in (f"@{detector}.{name}", f"@{detector}", f".{name}", "") if where in given),
             3.48,
         )
-        for name in "EFGH"
+        for name in "HGFE"
     )
     found = mission.amplifier_values("vis.gain", GAIN, detector)
     assert (found * 4 if len(found) == 1 else found) == wanted
@@ -80,8 +80,8 @@ def test_each_camera_has_its_detectors():
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("vis.gain.X", "vis has no amplifier 'X', only E, F, G, H"),
-        ("vis.gain@3-4.Q", "vis has no amplifier 'Q', only E, F, G, H"),
+        ("vis.gain.X", "vis has no amplifier 'X', only H, G, F, E"),
+        ("vis.gain@3-4.Q", "vis has no amplifier 'Q', only H, G, F, E"),
         ("vis.gain@7-1", "vis has no detector '7-1', only 36 from 1-1 to 6-6"),
         ("vis.gain@", "name of the detector is missing"),
         ("vis.gain@.E", "name of the detector is missing"),

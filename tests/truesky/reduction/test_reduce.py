@@ -23,7 +23,7 @@ GAINS = {
 }
 # Pixels of the quadrants of a detector of 256 columns.
 QUADRANTS = {
-    "E": np.s_[132:, :128], "F": np.s_[132:, 128:], "G": np.s_[:128, 128:], "H": np.s_[:128, :128],
+    "E": np.s_[:128, :128], "F": np.s_[:128, 128:], "G": np.s_[132:, 128:], "H": np.s_[132:, :128],
 }  # fmt: skip
 TABLE = Path(mission.__file__).parent / "models" / "amplifier_values_vis.csv"
 
@@ -138,7 +138,7 @@ def test_masters_agree_with_the_detector(made):
     pixels = np.ones(bias[1].data.shape, bool)
     pixels[128:132] = False
     # Noise of the mean of 5 frames: read noise and rounding, which differ between amplifiers.
-    # Quadrants E and F lie above the rows of charge injection, H and G below. The request sets the gains of E and H.
+    # Quadrants E and F lie below the rows of charge injection, H and G above. The request sets the gains of E and H.
     gain, noise = np.zeros(pixels.shape), np.zeros(pixels.shape)
     for name, part in QUADRANTS.items():
         gain[part], noise[part] = table_value("gain", name, 3.48), table_value("read_noise", name, 4.4)

@@ -9,6 +9,7 @@ from tests.truesky.render import fields, spectroscopic
 from tests.truesky.render.channels import spectral_lines
 from tests.truesky.render.channels.spectral_lines import Lines
 from tests.truesky.render.spectroscopic import TIME, strip
+from truesky.commands import __main__ as truesky
 from truesky.render import grisms
 from truesky.render.camera.detectors import detector
 from truesky.render.channels import registry
@@ -19,7 +20,8 @@ MISSION = resolve()
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("grisms") / "new"
-    assert grisms.main(["--out", str(path), "--detectors", "DET22", "DET31"]) == 0
+    words = ["export", "grisms", "--out", str(path), "--detectors", "DET22", "DET31"]
+    assert truesky.main(words) == 0
     return path
 
 
@@ -72,13 +74,15 @@ def test_sensitivity_agrees_with_the_zero_point():
     ("more", "message"),
     [
         (["--detectors", "DET99"], "DET99"),
-        (["--exposure", "3"], "LAKE and --exposure must be given together"),
+        (["--exposure", "3"], "LAKE and --exposure must be given together, or neither for the nominal grisms"),
         (["nowhere"], "LAKE and --exposure must be given together"),
+        (["--bands", "nisp_red"], "--bands and --columns are options of depth only"),
+        (["--form", "axe"], "--form axe: grisms can be written as grismconf"),
         (["--name", "a"], "--name requires LAKE"),
     ],
 )
 def test_errors_are_one_line_and_no_file_is_written(tmp_path, capsys, more, message):
-    assert grisms.main(["--out", str(tmp_path / "new"), *more]) == 2
+    assert truesky.main(["export", "grisms", *more, "--out", str(tmp_path / "new")]) == 2
     said = capsys.readouterr().err
     assert message in said
     assert len(said.splitlines()) == 1

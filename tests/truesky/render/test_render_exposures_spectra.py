@@ -17,9 +17,10 @@ from lake_schema.store import layout, publish, read
 from lake_schema.store.object_storage import push, s3
 from tests import requests
 from truesky.catalogue import build_galaxies, build_stars
+from truesky.commands import __main__ as commands
 from truesky.fluxes import compute_fluxes
 from truesky.reduction import masters
-from truesky.render import grisms, models, plan_exposures, render_exposures
+from truesky.render import models, plan_exposures, render_exposures
 from truesky.render.products import read_back
 from truesky.request.from_toml import parse
 from truesky.running import submitted_job
@@ -260,12 +261,12 @@ def test_invalid_models_are_refused_in_one_line(rendered, tmp_path, capsys, repl
 
 def test_grism_files_of_an_exposure_agree_with_its_spectra(rendered, tmp_path, capsys):
     """Traces and the wheel error agree; exposures without spectra give a one-line error and no file."""
-    arguments = ["--lake", str(rendered), "--out", str(tmp_path / "new"), "--exposure"]
+    arguments = ["export", "grisms", str(rendered), "--out", str(tmp_path / "new"), "--exposure"]
     for number, message in ((99, "no exposure 99"), (6, "exposure 6: NISP-S dark is no image of spectra")):
-        assert grisms.main([*arguments, str(number)]) == 2
+        assert commands.main([*arguments, str(number)]) == 2
         assert message in capsys.readouterr().err
         assert not (tmp_path / "new").exists()
-    assert grisms.main([*arguments, "3"]) == 0
+    assert commands.main([*arguments, "3"]) == 0
     found = grismconf.Config(str(tmp_path / "new" / "RGS000_000003_DET22.conf"))
     here = (pc.field("exposure_id") == 3) & (pc.field("detector") == "DET22")
     places = {row["id"]: row for row in read.version(rendered, "rendered_truth").rows(where=here).to_pylist()}

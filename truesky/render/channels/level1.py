@@ -13,23 +13,28 @@ IMG_T1 in raw frames of the survey. GWA_POS and GWA_TILT: names and units as in 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from datetime import datetime, timedelta
 from typing import Any
 
 from lake_schema import __version__
-from lake_schema.fits.images import Card
+from lake_schema.fits.images import Card, Image
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import GRISM_NAMES, ExposureRow
+from truesky.render.camera.sections import Section
 
 # Instrument in the name of a file, by channel. Files of ground cameras keep their names.
 INSTRUMENTS: Mapping[str, str] = {"VIS": "VIS", "NISP-P": "NISP", "NISP-S": "NISP"}
+# Channels whose arrays have the axes of the focal plane, not those of the detector.
+FOCAL_PLANE_AXES = ("VIS",)
 # Calendar date of MJD 0.
 _MJD_ZERO = datetime(1858, 11, 17)
 # Number by which the observation of a field grows with each visit; surveys have fewer fields.
 _VISIT_STEP = 100_000
-# Number added to the number of an exposure without a field, which is its own observation.
-_WITHOUT_FIELD = 10_000_000
+# Numbers added to the number of an exposure without a field, which is its own observation, and to the number of a field
+# at a user's position, which is not one of a survey.
+_WITHOUT_FIELD, _OWN_FIELD = 10_000_000, 200_000_000
 # Number by which the pointing grows with each observation; observations have fewer dithers.
 _POINTING_STEP = 1000
 # Decimals of angles in degrees, which are so exact on every processor.
@@ -46,17 +51,23 @@ _OVERSCANS = (
     ("OVRSCANX", "OVERSCAN", "[pix] number of serial overscan columns"),
     ("OVRSCANY", "OVERROWS", "[pix] number of parallel overscan rows"),
 )
+# Keywords of sections of an array, and of the places of an array's pixels on the detector and in the mosaic.
+_OWN_SECTIONS, _PLACES = ("DATASEC", "TRIMSEC", "BIASSEC"), ("CCDSEC", "DETSEC")
+# Keyword of a SIP coefficient, with the powers of column and row.
+_SIP_COEFFICIENT = re.compile(r"[AB]_(\d+)_(\d+)")
 
 
 def observation(exposure: ExposureRow) -> int:
     """Return the number of the observation (OBS_ID) to which an exposure belongs.
 
-    It is the number of the field plus 100,000 for each earlier visit. Without a field it is the number of the exposure
-    plus 10,000,000, so that it differs from the numbers of fields.
+    It is the number of the field plus 100,000 for each earlier visit, and plus 200,000,000 for a user's own position,
+    which is more than the numbers of 1000 visits.
+    Without a field it is the number of the exposure plus 10,000,000, so that it differs from the numbers of fields.
     """
     if exposure.field is None:
         return _WITHOUT_FIELD + exposure.exposure_id
-    return exposure.field + _VISIT_STEP * ((exposure.visit or 1) - 1)
+    number = exposure.field + _VISIT_STEP * ((exposure.visit or 1) - 1)
+    return _OWN_FIELD + number if exposure.survey == "own" else number
 
 
 def file_name(exposure: ExposureRow) -> str:
@@ -191,3 +202,50 @@ def array_cards(name: str, header: Mapping[str, Any], exposure: ExposureRow) -> 
     text = {"RA": "right ascension", "DEC": "declination", "PA": "position angle"}
     cards += [(key, round(value, _DECIMALS), f"[deg] boresight {text[key]}") for key, value in pointing]
     return tuple(cards)
+
+
+def turn_array(image: Image) -> Image:
+    """Turn an array by 180 deg, with its WCS and its sections, so that each pixel keeps its place on the sky.
+
+    Arrays of VIS have the axes of the focal plane in Euclid's files, and the axes of the CCD in files of detectors. The
+    two are opposite for CCDs that are mounted upside down.
+    """
+    assert image.data is not None
+    ny, nx = image.data.shape
+    return Image(image.data[::-1, ::-1], turn_cards(image.cards, (nx, ny)), image.name)
+
+
+def turn_cards(cards: Iterable[Card], size: tuple[int, int]) -> tuple[Card, ...]:
+    """Return the header of an array that is turned by 180 deg.
+
+    Parameters
+    ----------
+    cards : iterable of Card
+        Header of the array: sections, and a WCS with the matrix CD and distortion as SIP or TPV.
+    size : (int, int)
+        Numbers of columns and rows of the array.
+
+    Returns
+    -------
+    tuple of Card
+        The same keywords; the numbers in CCDSEC and DETSEC run in the opposite direction.
+    """
+    return tuple((keyword, _turn_value(keyword, value, size), text) for keyword, value, text in cards)
+
+
+def _turn_value(keyword: str, value: Any, size: tuple[int, int]) -> Any:
+    if keyword in ("CRPIX1", "CRPIX2"):
+        return size[int(keyword[-1]) - 1] + 1.0 - value
+    if re.fullmatch(r"CD[12]_[12]", keyword):
+        return -value
+    if powers := _SIP_COEFFICIENT.fullmatch(keyword):
+        # The distortion of a column or row changes its sign, and so does each factor of the term.
+        return value if (int(powers[1]) + int(powers[2])) % 2 else -value
+    if keyword in _OWN_SECTIONS:
+        section = Section.from_text(value)
+        x, y = size[0] - section.x - section.nx, size[1] - section.y - section.ny
+        return Section(x, y, section.nx, section.ny).text
+    if keyword in _PLACES:
+        return re.sub(r"(\d+):(\d+)", r"\2:\1", value)
+    # Coefficients of TPV apply after the matrix CD and do not change.
+    return value

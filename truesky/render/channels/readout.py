@@ -232,7 +232,7 @@ RAMP_AND_CHI2 = replace(RAMP, make_readout=partial(_ramp, store_chi2=True))
 def _quadrants(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
     """Make the four arrays (ADU) of a VIS detector, one per quadrant, each with its prescan and overscan.
 
-    Their names are the name of the detector, a dot and that of the quadrant: "3-4.E".
+    Their names are the name of the detector, a dot and that of the quadrant. They are sorted by name: "3-4.E" is first.
     """
     raw = adc.to_file_type(frame, scene)
     prescan, overscan, rows, middle = sizes = layout.overscan_sizes(scene)
@@ -243,7 +243,8 @@ def _quadrants(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readou
         ("INJROWS", middle, "[pix] charge-injection rows between the halves"),
     )  # fmt: skip
     extensions = []
-    for number, name in enumerate(layout.NAMES):
+    for number in layout.FILE_ORDER:
+        name = layout.NAMES[number]
         # Number of columns and rows to add to a position on the detector to get the position in this quadrant's array.
         across, up = layout.pixel_offset(number, raw[number].shape, *sizes)
         place = astrometry.cards(astrometry.shift_pixels(system, across, up))
@@ -273,7 +274,7 @@ def _quadrant_electrons(read: Sequence[Image]) -> Float:
     raw, sizes = _read_quadrants(read)
     # Use the card GAIN in the header of each quadrant's extension or, if it has none, in the primary header of the
     # file.
-    headers = [{**_header(read[0]), **_header(unit)} for unit in read[1:]]
+    headers = [{**_header(read[0]), **_header(unit)} for unit in layout.in_plane_order(read[1:])]
     gain = np.array([float(cards["GAIN"]) for cards in headers]).reshape(-1, 1, 1)
     _, overscan, rows, _ = sizes
     # Measure the bias in the half of the overscan columns that is read last: the first half contains charge that traps
@@ -289,7 +290,8 @@ def _read_quadrants(read: Sequence[Image]) -> tuple[Array, tuple[int, int, int, 
     halves of the detector.
     """
     header = _header(read[0])
-    raw = np.stack([layout.to_detector_axes(np.asarray(unit.data), number) for number, unit in enumerate(read[1:])])
+    planes = enumerate(layout.in_plane_order(read[1:]))
+    raw = np.stack([layout.to_detector_axes(np.asarray(unit.data), number) for number, unit in planes])
     prescan, overscan, rows, between = (int(header[key]) for key in ("PRESCAN", "OVERSCAN", "OVERROWS", "INJROWS"))
     return raw, (prescan, overscan, rows, between)
 

@@ -277,6 +277,8 @@ def _block_of_observation(
     scheduled = _schedule_block(block, request, block_settings.mission, where, nisp_free_mjd)
     if not scheduled.base_exposures:
         raise BadInput(f"{where} has no exposures")
+    if _is_own_field(block):
+        scheduled = scheduled.with_field(1 + sum(_is_own_field(other) for other in request.observations[:number]))
     settings_by_key: dict[_SettingsKey, _ResolvedSettings] = {(True, ()): block_settings, (False, ()): shared}
     for exposure in scheduled.base_exposures:
         of_nisp = exposure.camera == "nisp"
@@ -352,12 +354,35 @@ class _ScheduledBlock:
     fields: tuple[reference_survey.Field, ...] = ()
     make_exposures: Callable[[reference_survey.Field], Iterable[Exposure]] | None = None
 
+    def with_field(self, number: int) -> _ScheduledBlock:
+        """Return the same observation with another number of its field, which does not change the positions."""
+        if self.make_exposures is None:
+            return self
+        base = tuple(replace(exposure, field=number) for exposure in self.base_exposures)
+        return replace(
+            self, base_exposures=base, make_exposures=partial(_exposures_of_field, self.make_exposures, number)
+        )
+
     def last_exposures(self) -> Iterable[Exposure]:
         """Return exposures of the observation that include the last one of each channel.
 
         They are the exposures of the last field, or all exposures if the observation has no fields.
         """
         return self.base_exposures if self.make_exposures is None else self.make_exposures(self.fields[-1])
+
+
+def _is_own_field(block: Observation) -> bool:
+    """Return True for an observation of Euclid's sequence of exposures at a position that the user gives."""
+    is_frame = bool(block.pointings) or block.image_type in _CALIBRATION or "EXT" in block.channels
+    return block.field_centre is not None and not is_frame
+
+
+def _exposures_of_field(
+    make_exposures: Callable[[reference_survey.Field], Iterable[Exposure]], number: int, field: reference_survey.Field
+) -> Iterator[Exposure]:
+    """Generate the exposures of a visit, with another number of the field."""
+    for exposure in make_exposures(field):
+        yield replace(exposure, field=number)
 
 
 def _schedule_block(

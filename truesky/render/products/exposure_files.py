@@ -122,18 +122,22 @@ def make_exposure_file(lake: Path, facts: Json) -> Output:
     )
     mission = read_back(read.version(lake, "mission", products.manifest["facts"]["inputs"]["mission"]))
     order = _sort_detectors(mission, exposure["camera"], facts["detectors"])
-    files = [(name, products.sidecar_path(rows[name]["path"])) for name in order]
-    heads = [products.sidecar_path(head_files.head_path(rows[name]["path"])) for name in order]
+    files = [(detector.name, products.sidecar_path(rows[detector.name]["path"])) for detector in order]
+    heads = [products.sidecar_path(head_files.head_path(rows[name]["path"])) for name, _ in files]
+    # Arrays of VIS have the axes of the focal plane in Euclid's files.
+    has_focal_plane_axes = is_euclid and exposure["channel"] in level1.FOCAL_PLANE_AXES
+    turned = [detector.name for detector in order if has_focal_plane_axes and detector.upside_down]
+    extra = _cards(exposure, facts, mission, is_euclid)
     writers = {
-        path: partial(_write, files, *_cards(exposure, facts, mission, is_euclid), _kept_keywords(exposure["camera"])),
-        head_files.head_path(path): partial(_write_heads, heads),
+        path: partial(_write, files, *extra, _kept_keywords(exposure["camera"]), turned),
+        head_files.head_path(path): partial(_write_heads, files, heads, turned),
     }
     return Output(table, writers)
 
 
-def _sort_detectors(mission: MissionConfiguration, camera: str, names: Sequence[str]) -> list[str]:
-    """Return the given names of detectors in the order in which the mission database lists them for the camera."""
-    return [detector.name for detector in detectors.detectors(camera, mission) if detector.name in names]
+def _sort_detectors(mission: MissionConfiguration, camera: str, names: Sequence[str]) -> list[detectors.Detector]:
+    """Return the detectors with the given names, in the order of the mission database."""
+    return [detector for detector in detectors.detectors(camera, mission) if detector.name in names]
 
 
 def _cards(
@@ -152,8 +156,16 @@ def _cards(
     return cards, partial(level1.array_cards, exposure=row)
 
 
-def _write_heads(files: Sequence[Path], path: Path) -> None:
-    head_files.write((file.read_text(encoding="ascii") for file in files), path)
+def _write_heads(files: Sequence[tuple[str, Path]], heads: Sequence[Path], turned: Sequence[str], path: Path) -> None:
+    """Join the head files of image files, after turning the WCS by 180 deg for files with names in `turned`."""
+    texts = []
+    for (name, file), head in zip(files, heads, strict=True):
+        text = head.read_text(encoding="ascii")
+        if name in turned:
+            sizes = joined.array_sizes(file)
+            text = head_files.change_images(text, [partial(level1.turn_cards, size=size) for size in sizes])
+        texts.append(text)
+    head_files.write(texts, path)
 
 
 def _kept_keywords(camera: str) -> tuple[str, ...]:
@@ -166,6 +178,8 @@ def _write(
     cards: Sequence[Card],
     array_cards: joined.ArrayCards,
     kept_keywords: Sequence[str],
+    turned: Sequence[str],
     path: Path,
 ) -> None:
-    joined.join(path, files, _EXPOSURE_KEYWORDS, cards, kept_keywords, array_cards)
+    changes = dict.fromkeys(turned, level1.turn_array)
+    joined.join(path, files, _EXPOSURE_KEYWORDS, cards, kept_keywords, array_cards, changes)

@@ -11,13 +11,15 @@ SCAMP and SWarp, "external headers"
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 from lake_schema.fits import images
 from lake_schema.fits.images import Card, Image
 from truesky.render.camera import tpv
 
+# Last line of the cards of each image.
+_END = "END\n"
 # WCS keywords in a head file, without the digits and underscores at their end.
 _WCS_KEYWORDS = ("RADESYS", "CTYPE", "CUNIT", "CRVAL", "CRPIX", "CD", "PV")
 
@@ -38,6 +40,16 @@ def text(units: Sequence[Image]) -> str:
 def write(texts: Iterable[str], path: Path) -> None:
     """Write the texts of head files one after another to one head file `path`."""
     path.write_text("".join(texts), encoding="ascii")
+
+
+def change_images(head_text: str, changes: Sequence[Callable[[Sequence[Card]], Iterable[Card]]]) -> str:
+    """Return the text of a head file in which the cards of each image are replaced by a function of them.
+
+    `changes` has the functions of the images, in file order.
+    """
+    texts = head_text.split(_END)[:-1]
+    changed = (change(images.cards_from_text(image_text)) for image_text, change in zip(texts, changes, strict=True))
+    return "".join(f"{images.cards_to_text(tuple(cards))}{_END}" for cards in changed)
 
 
 def first_cards(path: Path) -> tuple[Card, ...]:
@@ -61,4 +73,4 @@ def _image_text(unit: Image) -> str:
     if not cards:
         return ""
     # SExtractor, SCAMP and SWarp do not know ICRS. J2000 is the closest system.
-    return f"{images.cards_to_text([('EQUINOX', 2000.0, 'mean equinox'), *cards])}END\n"
+    return f"{images.cards_to_text([('EQUINOX', 2000.0, 'mean equinox'), *cards])}{_END}"

@@ -168,9 +168,9 @@ def test_the_quadrants_of_vis_differ(key, unit, mean, spread):
     # Neighbouring quadrants are not alike, and detectors are not alike.
     assert np.abs(np.diff(found, axis=1)).mean() > 0.8 * spread * mean
     assert found.mean(axis=1).std() > 0.3 * spread * mean
-    # As in the file of the detector: 1-1.E is the first line, 6-6.H the last.
+    # In the order of the planes: 1-1.H is the first line, 6-6.E the last.
     rows = MISSION.rows("vis.amplifier_values")
-    assert [(row["detector"], row["amplifier"]) for row in rows[::143]] == [("1-1", "E"), ("6-6", "H")]
+    assert [(row["detector"], row["amplifier"]) for row in rows[::143]] == [("1-1", "H"), ("6-6", "E")]
     np.testing.assert_allclose(found.ravel(), [float(row[key]) for row in rows], rtol=1e-5)
 
 
@@ -178,8 +178,8 @@ def test_a_request_replaces_values_of_quadrants():
     """A value for the camera makes all alike; one for a detector or a quadrant leaves the others as they are."""
     usual = values_of_quadrants("gain", GAIN)
     for name, replaced in (
-        ("vis.gain", np.s_[:, :]), ("vis.gain@3-4", np.s_[15, :]), ("vis.gain.F", np.s_[:, 1]),
-        ("vis.gain@3-4.E", np.s_[15, 0]),
+        ("vis.gain", np.s_[:, :]), ("vis.gain@3-4", np.s_[15, :]), ("vis.gain.F", np.s_[:, 2]),
+        ("vis.gain@3-4.E", np.s_[15, 3]),
     ):  # fmt: skip
         wanted = usual.copy()
         wanted[replaced] = 3.3

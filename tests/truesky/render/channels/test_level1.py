@@ -86,6 +86,12 @@ def test_pointings_have_different_numbers():
     assert len(numbers) == 3 * 60
 
 
+def test_fields_at_own_positions_are_not_those_of_a_survey():
+    numbers = [cards(field=1, visit=visit, survey=name)["OBS_ID"] for name in ("wide", "own") for visit in (1, 2)]
+    assert numbers == [1, 100001, 200000001, 200100001]
+    assert cards(field=99_999, visit=1000, survey="wide")["OBS_ID"] < min(numbers[2:])
+
+
 def test_wheels_of_nisp():
     """Angles of the survey: 184 deg is RGS180 turned by 4 deg, -4 deg RGS000 by -4 deg (Serrano et al. 2024)."""
     keys = ("FWA_POS", "GWA_POS", "GWA_TILT", "OBSTYPE", "N_DET", "FITS_DEF")

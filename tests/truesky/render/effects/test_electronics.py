@@ -65,7 +65,8 @@ def test_each_corner_is_read_first():
     frame[-1, 0], frame[-1, -1], frame[0, -1], frame[0, 0] = 1, 2, 3, 4
     parts = quadrants.apply(frame, *quadrants.overscan_sizes(SCENE))
     assert parts.shape == (4, 2086, 2128)
-    assert "".join(quadrants.NAMES) == "EFGH"
+    assert "".join(quadrants.NAMES) == "HGFE"
+    assert [quadrants.NAMES[number] for number in quadrants.FILE_ORDER] == list("EFGH")
     assert [parts[i, 0, 51] for i in range(4)] == [1, 2, 3, 4]
     assert parts.sum() == 10
 

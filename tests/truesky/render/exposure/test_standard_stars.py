@@ -51,7 +51,7 @@ def test_the_star_is_named_once_in_a_file_of_the_exposure(tmp_path):
     rows, writers = fits_files.products(rendered("Vega"), ())
     writers[rows["path"][0].as_py()](tmp_path / "one.fits")
     files, kept = [(name, tmp_path / "one.fits") for name in ("DET22", "DET23")], exposure_files._kept_keywords("nisp")
-    exposure_files._write(files, (), joined.no_cards, kept, tmp_path / "all.fits")
+    exposure_files._write(files, (), joined.no_cards, kept, (), tmp_path / "all.fits")
     first, *arrays = images.read_images(tmp_path / "all.fits")
     assert "Vega" in [value for key, value, _ in first.cards if key == "TARGET"]
     assert "TARGET" not in {key for unit in arrays for key, *_ in unit.cards}

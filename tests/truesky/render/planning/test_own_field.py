@@ -9,10 +9,12 @@ import pytest
 
 from lake_schema import sky
 from lake_schema.errors import BadInput
+from lake_schema.tables.exposures import ExposureRow
 from tests.house.test_names import ROOT
 from tests.truesky import nightly
 from truesky.commands import plan
 from truesky.render import plan_exposures
+from truesky.render.channels import level1
 from truesky.request.area import parse
 from truesky.request.exposures import pointing_tables
 from truesky.request.from_toml import from_table
@@ -38,6 +40,24 @@ def one_visit(ra, dec, angle):
 def upright(ra, dec):
     """Rows of `tasks` of a field with position angle 0, the reference for all angles."""
     return one_visit(ra, dec, 0.0)[1]
+
+
+def test_observations_at_own_positions_have_different_numbers():
+    """The second observation has the field number 2 and the same exposures as without the first one."""
+    blocks = [
+        {"channels": ["VIS"], "ra": ra, "dec": 5.0, "flat": False, "short": False, "visits": 2} for ra in (20.0, 24.0)
+    ]
+    cone = {"ra": 22.0, "dec": 5.0, "radius": 4.0}
+    both, second = (
+        plan_exposures.plan(None, from_table({**BASE, "area": {"cone": cone}, "observation": chosen}))[1].to_pylist()
+        for chosen in (blocks, blocks[1:])
+    )
+    rows = [ExposureRow.from_row(row) for row in both]
+    assert [(row.field, row.visit) for row in rows[::4]] == [(1, 1), (1, 2), (2, 1), (2, 2)]
+    assert len({level1.observation(row) for row in rows}) == 4
+    assert len({(level1.observation(row), row.dither) for row in rows}) == len(rows) == 16
+    for name in ("ra", "dec", "mjd", "position_angle", "visit", "dither"):
+        assert [row[name] for row in both[8:]] == [row[name] for row in second], name
 
 
 @pytest.mark.parametrize(("ra", "dec"), PLACES)

@@ -420,7 +420,7 @@ def test_translators_find_the_detectors_in_the_file_of_an_exposure(camera, rice,
     names = [name for key, name in CCDS if key == camera]
     files = [(name, written(frame(camera, name), tmp_path, rice)) for name in names]
     path = tmp_path / "exposure.fits"
-    exposure_files._write(files, (), joined.no_cards, exposure_files._kept_keywords(camera), path)
+    exposure_files._write(files, (), joined.no_cards, exposure_files._kept_keywords(camera), (), path)
     translator = {"decam": DecamTranslator, "megacam": MegaPrimeTranslator}[camera]
     found = [
         ObservationInfo(header, translator_class=translator, pedantic=True)

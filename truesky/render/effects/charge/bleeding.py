@@ -176,8 +176,8 @@ def parameters(scene: Scene) -> tuple[float | Float, Segments]:
     full_wells = scene.amplifier_values("full_well", "electron")
     if not isinstance(full_wells, np.ndarray):
         return full_wells, scene.column_segments
-    # Only detectors that are read in quadrants have several. The order is upper left (E), upper right (F), lower right
-    # (G), lower left (H).
+    # Only detectors that are read in quadrants have several. The order is upper left (H), upper right (G), lower right
+    # (F), lower left (E).
     upper_left, upper_right, lower_right, lower_left = full_wells
     is_right = np.arange(scene.nx) >= scene.nx // 2
     lower, upper = np.where(is_right, lower_right, lower_left), np.where(is_right, upper_right, upper_left)

@@ -108,7 +108,7 @@ def coefficients(scene: Scene) -> Frame:
         return amplifiers.crosstalk_couplings(scene.value("crosstalk", ""), largest, scene.detector, scene.layout)
     row_neighbour = column_neighbour = scene.value("crosstalk", "")
     diagonal = _DIAGONAL * row_neighbour
-    # The order of the quadrants is upper left (E), upper right (F), lower right (G), lower left (H).
+    # The order of the quadrants is upper left (H), upper right (G), lower right (F), lower left (E).
     return np.array(
         [
             [0, row_neighbour, diagonal, column_neighbour],

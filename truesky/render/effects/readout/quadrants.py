@@ -4,13 +4,24 @@ A VIS detector is read through its four corners. Between its halves are rows for
 light and cosmic rays that fall there are lost.
 
 In readout order the axes are [quadrant, row, column], and the pixel at [0, 0] of each quadrant is read first. The
-quadrants are E (upper left), F (upper right), G (lower right) and H (lower left), as in the Euclid Data Product
-Description Document, LE1 VIS. Columns are prescan, pixels and overscan, in this order; rows are pixels and overscan.
-The amplifiers of ground cameras are listed in a table of the detector in the mission database.
+quadrants are H (upper left), G (upper right), F (lower right) and E (lower left). Columns are prescan, pixels and
+overscan, in this order; rows are pixels and overscan. The amplifiers of ground cameras are listed in a table of the
+detector in the mission database.
+
+The letters follow two programs for Euclid's frames, which agree. The programs give places along the axes of the focal
+plane: E is at the lower left in columns 1 to 3 of the grid of CCDs, and at the upper right in columns 4 to 6. CCDs in
+columns 4 to 6 are mounted upside down. The quadrant E is therefore at the lower left of every CCD along the axes of the
+CCD, which this module uses.
+
+References
+----------
+Euclid's package SHE_PPT, function get_vis_quadrant, after the charts of the Euclid Data Product Description
+Document, LE1 VIS. PyAutoArray, function roe_corner_from.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -18,15 +29,19 @@ import numpy.typing as npt
 
 from lake_schema.arrays import Int
 from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.fits.images import Image
 from truesky.render.camera.amplifiers import Layout
 from truesky.render.camera.sections import Section, Sections
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-NAMES = "EFGH"
-# For the quadrants E, F, G and H: True if the quadrant is in the upper half of the detector.
+# Names of the quadrants in the order of the planes, which is clockwise from the upper left.
+NAMES = "HGFE"
+# Numbers of the planes in the order of a file's extensions, which is that of the letters: E, F, G and H.
+FILE_ORDER = tuple(sorted(range(len(NAMES)), key=NAMES.__getitem__))
+# For the quadrants H, G, F and E: True if the quadrant is in the upper half of the detector.
 _UPPER = (True, True, False, False)
-# For the quadrants E, F, G and H: True if the quadrant is in the right half of the detector.
+# For the quadrants H, G, F and E: True if the quadrant is in the right half of the detector.
 _RIGHT = (False, True, True, False)
 
 Number = TypeVar("Number", bound=np.generic)
@@ -40,7 +55,7 @@ def apply(
     injection_rows: int = 0,
     rng: np.random.Generator | None = None,
 ) -> Frame:
-    """Split a frame into the four quadrants E, F, G, H, each flipped so that the pixel at [0, 0] is read first.
+    """Split a frame into the four quadrants H, G, F, E, each flipped so that the pixel at [0, 0] is read first.
 
     Parameters
     ----------
@@ -58,7 +73,7 @@ def apply(
     Returns
     -------
     float array, shape (4, (ny - injection_rows) / 2 + rows, prescan + nx / 2 + overscan)
-        Electrons of the quadrants E (upper left), F (upper right), G (lower right) and H (lower left); 0 in prescan and
+        Electrons of the quadrants H (upper left), G (upper right), F (lower right) and E (lower left); 0 in prescan and
         overscan.
 
     Raises
@@ -150,10 +165,30 @@ def quadrant_of_pixel(column: int, row: int, nx: int, ny: int) -> int:
     Returns
     -------
     int
-        0 to 3 for E, F, G, H. Rows between the halves, which are not read, count to the nearer half.
+        0 to 3 for H, G, F, E. Rows between the halves, which are not read, count to the nearer half.
     """
-    place = row >= ny / 2, column >= nx / 2
-    return next(n for n, half in enumerate(zip(_UPPER, _RIGHT, strict=True)) if half == place)
+    return number_of_place(row >= ny / 2, column >= nx / 2)
+
+
+def number_of_place(is_upper: bool, is_right: bool) -> int:
+    """Return the index of the quadrant in the upper or lower and in the right or left half of the detector, 0 to 3."""
+    return next(n for n, half in enumerate(zip(_UPPER, _RIGHT, strict=True)) if half == (is_upper, is_right))
+
+
+def in_plane_order(extensions: Sequence[Image]) -> list[Image]:
+    """Sort the extensions of a detector's file in the order of its amplifiers, which is that of the planes of an array.
+
+    Only quadrants have another order in files. Their order is found from their sections on the detector (CCDSEC), not
+    from their letters, so that files of earlier versions with other letters are read, too.
+    """
+
+    def number(extension: Image) -> int:
+        text = next(value for keyword, value, _ in extension.cards if keyword == "CCDSEC")
+        section = Section.from_text(str(text))
+        return number_of_place(section.y > 0, section.x > 0)
+
+    has_quadrants = all("QUADRANT" in {keyword for keyword, *_ in extension.cards} for extension in extensions)
+    return sorted(extensions, key=number) if has_quadrants else list(extensions)
 
 
 def pixel_offset(
@@ -166,7 +201,7 @@ def pixel_offset(
     Parameters
     ----------
     number : int
-        Index of the quadrant, 0 to 3 for E, F, G, H.
+        Index of the quadrant, 0 to 3 for H, G, F, E.
     shape : (int, int)
         Rows and columns of the quadrant, with prescan and overscan.
     prescan, overscan : int
@@ -196,7 +231,7 @@ def sections(
     Parameters
     ----------
     number : int
-        Index of the quadrant, 0 to 3 for E, F, G, H.
+        Index of the quadrant, 0 to 3 for H, G, F, E.
     shape : (int, int)
         Rows and columns of the quadrant, with prescan and overscan.
     prescan, overscan : int
@@ -233,7 +268,7 @@ def assemble(
     Parameters
     ----------
     quadrants : array, shape (4, ny, nx)
-        Quadrants E, F, G, H with prescan and overscan, the result of `apply`.
+        Quadrants H, G, F, E with prescan and overscan, the result of `apply`.
     prescan, overscan : int
         Number of columns before and after the pixels of a quadrant.
     rows : int
@@ -249,9 +284,9 @@ def assemble(
     pixels = [
         to_detector_axes(q[: q.shape[0] - rows, prescan : q.shape[1] - overscan], i) for i, q in enumerate(quadrants)
     ]
-    e, f, g, h = pixels
-    middle_block = np.zeros((injection_rows, h.shape[1] + g.shape[1]), quadrants.dtype)
-    return np.concatenate([np.hstack([h, g]), middle_block, np.hstack([e, f])])
+    upper_left, upper_right, lower_right, lower_left = pixels
+    middle_block = np.zeros((injection_rows, lower_left.shape[1] + lower_right.shape[1]), quadrants.dtype)
+    return np.concatenate([np.hstack([lower_left, lower_right]), middle_block, np.hstack([upper_left, upper_right])])
 
 
 def overscan_sizes(scene: Scene) -> tuple[int, int, int, int]:
