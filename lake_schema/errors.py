@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import ParamSpec, TypeVar, cast
@@ -200,6 +201,8 @@ class OutOfRange(BadInput):
 
     def __init__(self, name: str, value: object, lo: object, hi: object, unit: str = "", question: str = "") -> None:
         limits = f"{name} = {quote_value(value, str)} is outside [{lo}, {hi}] {unit}".rstrip()
+        if (lo, hi) == (-math.inf, math.inf):
+            limits = f"{name} = {quote_value(value, str)} is not a finite number"
         super().__init__(f"{limits}: {question}" if question else limits)
         self._arguments = name, value, lo, hi, unit, question
 

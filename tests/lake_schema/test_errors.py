@@ -1,5 +1,6 @@
 """Error messages are one printable line, even if they name something long or strange."""
 
+import math
 import pickle
 
 import pytest
@@ -39,6 +40,12 @@ def test_unprintable_characters_are_escaped():
 def test_a_refusal_comes_back_from_another_process(refusal):
     back = pickle.loads(pickle.dumps(refusal))
     assert (type(back), str(back)) == (type(refusal), str(refusal))
+
+
+def test_a_number_without_limits_must_be_finite():
+    refusal = errors.OutOfRange("gain", float("nan"), -math.inf, math.inf, "electron")
+    assert str(refusal) == "gain = nan is not a finite number"
+    assert str(errors.OutOfRange("gain", 3.0, 0.0, 1.0)) == "gain = 3.0 is outside [0.0, 1.0]"
 
 
 def read_with_mistakes():

@@ -109,7 +109,7 @@ COMMANDS = {
         simulation.add_render_arguments, ("truesky.render.render_exposures",), True,
     ),
     "randoms": Command(
-        "simulate", "REQUEST LAKE", "make random points in the area of a band",
+        "simulate", "REQUEST LAKE", "make random points in the areas of bands",
         "requests/demo.toml my_lake --density 30 --band euclid_vis", simulation.add_randoms_arguments,
         ("truesky.emulator.build_randoms",), True,
     ),

@@ -109,6 +109,9 @@ class Parser(argparse.ArgumentParser):
         words = self._move_to_positions(list(sys.argv[1:] if args is None else args))
         self._words = words
         parsed, rest = super().parse_known_args(words, namespace)
+        # argparse returns "--" and the lake after it as the rest if it has already taken an optional LAKE as missing.
+        if rest[:1] == ["--"] and len(rest) == 2 and getattr(parsed, "lake", "") is None:
+            parsed.lake, rest = rest[1], []
         if unknown := next((word for word in rest if word.startswith("-")), None):
             name = unknown.partition("=")[0]
             self.error(f"there is no option {name}{self._similar_option(name)}")

@@ -8,16 +8,18 @@ from pathlib import Path
 from truesky.command_line.parser import Parser
 
 # Options of jobs that replace a field of the request: name and help text. The options in LISTS have several texts as
-# value, and the options in INTEGERS, NUMBERS and TEXTS one integer, one number and one text.
+# value, and the options in INTEGERS and NUMBERS one integer and one number.
 FLUX_LISTS = (("bands", "passbands that replace those of the request"),)
 RENDER_LISTS = (("detectors", "only these detectors of each exposure"),)
 RENDER_INTEGERS = (("limit", "only this number of detectors, the first by exposure and name"),)
-RANDOM_LISTS = (("model", "file of truesky train, for the column `detection`"),)
+RANDOM_LISTS = (
+    ("band", "passbands whose areas are filled (default: the only one)"),
+    ("model", "files of truesky train, for the column `detection`"),
+)
 RANDOM_NUMBERS = (
     ("density", "random points per arcmin2 (default: 30)"),
     ("magnitude", "AB magnitude of the galaxies of `detection`"),
 )
-RANDOM_TEXTS = (("band", "passband whose area is filled (default: the only one)"),)
 EMULATE_LISTS = (("model", "files of truesky train, one for each band"),)
 EMULATE_FLAGS = (("extrapolate", "allow depths outside the range of a model, and flag them"),)
 NEW_LAKE = "folder of the lake (created if it does not exist)"
@@ -30,7 +32,6 @@ def add_job_arguments(
     integers: _Options = (),
     can_forecast: bool = False,
     numbers: _Options = (),
-    texts: _Options = (),
     flags: _Options = (),
 ) -> None:
     """Declare the arguments of a job: the request, the lake, and options.
@@ -43,21 +44,19 @@ def add_job_arguments(
         Name and help text of the options that replace a field of the request by texts or by an integer.
     can_forecast : bool
         True if the job has the options --dry-run and --json.
-    numbers, texts : tuple of (str, str)
-        Name and help text of the options that replace a field of the request by a number or by a text.
+    numbers : tuple of (str, str)
+        Name and help text of the options that replace a field of the request by a number.
     flags : tuple of (str, str)
         Name and help text of the options without a value that set a field of the request to True.
     """
     parser.add_request()
     parser.add_lake(NEW_LAKE)
     for name, text in lists:
-        parser.add_argument(f"--{name}", nargs="+", metavar="NAME", help=text)
+        parser.add_argument(f"--{name}", nargs="+", action="extend", metavar="NAME", help=text)
     for name, text in integers:
         parser.add_argument(f"--{name}", type=int, metavar="N", help=text)
     for name, text in numbers:
         parser.add_argument(f"--{name}", type=float, metavar="X", help=text)
-    for name, text in texts:
-        parser.add_argument(f"--{name}", metavar="NAME", help=text)
     for name, text in flags:
         parser.add_argument(f"--{name}", action="store_true", help=text)
     if can_forecast:
@@ -94,7 +93,7 @@ def add_render_arguments(parser: Parser) -> None:
 
 def add_randoms_arguments(parser: Parser) -> None:
     """Declare the arguments of `truesky randoms`."""
-    add_job_arguments(parser, RANDOM_LISTS, numbers=RANDOM_NUMBERS, texts=RANDOM_TEXTS)
+    add_job_arguments(parser, RANDOM_LISTS, numbers=RANDOM_NUMBERS)
 
 
 def add_emulate_arguments(parser: Parser) -> None:

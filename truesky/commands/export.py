@@ -1,4 +1,4 @@
-"""truesky export: write catalogues and depth maps of a lake in the formats of other programs."""
+"""truesky export: write catalogues, depth maps and grisms in the formats of other programs."""
 
 from __future__ import annotations
 
@@ -25,12 +25,10 @@ def run_command(options: argparse.Namespace) -> int:
     form = options.form or forms[0]
     if form not in forms:
         raise BadInput(f"--form {form}: {options.what} can be written as {', '.join(forms)}{suggestion(form, forms)}")
-    if options.epoch is not None and options.what != "gaia":
-        raise BadInput("--epoch is an option of gaia only")
-    if options.release is not None and form != "table":
-        raise BadInput("--release is an option of gaia as a table only")
-    if (options.bands or options.columns) and options.what != "depth":
-        raise BadInput("--bands and --columns are options of depth only")
+    _refuse_options(options, form)
+    if options.what == "grisms":
+        print(f"{options.out}: {_write_grisms(options)} configurations")
+        return 0
     lake = layout.resolve_lake(options.lake)
     if options.what == "gaia":
         declared = gaia_archive.RELEASES[options.release or exports.RELEASES[0]]
@@ -43,6 +41,32 @@ def run_command(options: argparse.Namespace) -> int:
         summary = _write_folder(lake, options.what, form, user_files.check_folder(options.out), options.name)
     print(f"{options.out}: {summary}")
     return 0
+
+
+def _refuse_options(options: argparse.Namespace, form: str) -> None:
+    """Raise BadInput if an option belongs to another export, or LAKE is missing."""
+    if options.epoch is not None and options.what != "gaia":
+        raise BadInput("--epoch is an option of gaia only")
+    if options.release is not None and form != "table":
+        raise BadInput("--release is an option of gaia as a table only")
+    if (options.bands or options.columns) and options.what != "depth":
+        raise BadInput("--bands and --columns are options of depth only")
+    if (options.detectors or options.exposure is not None) and options.what != "grisms":
+        raise BadInput("--exposure and --detectors are options of grisms only")
+    if not options.lake and options.what != "grisms":
+        raise BadInput(f"LAKE is missing: write truesky export {options.what} LAKE --out PATH")
+
+
+def _write_grisms(options: argparse.Namespace) -> int:
+    """Write the nominal grisms, or the grisms of an exposure of a lake, and return the number of configurations."""
+    from truesky.render import grisms
+
+    if bool(options.lake) != (options.exposure is not None):
+        raise BadInput("LAKE and --exposure must be given together, or neither for the nominal grisms")
+    if options.name and not options.lake:
+        raise BadInput("--name requires LAKE")
+    folder, lake = user_files.check_folder(options.out), layout.resolve_lake(options.lake) if options.lake else None
+    return grisms.write(folder, lake, options.exposure, options.detectors, options.name)
 
 
 def _write_folder(lake: Path, what: str, form: str, folder: Path, request: str | None) -> str:

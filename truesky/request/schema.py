@@ -45,9 +45,8 @@ MAX_SHEAR = 0.9
 EFFECTS = (
     "adc", "amplifiers", "background", "bias_drift", "bias_structure", "bleeding", "brighter_fatter",
     "calibration_lamp", "charge_injection", "chromatic_response", "cosmic_rays", "crosstalk", "dark_current",
-    "dark_map",
-    "detector_crosstalk", "dispersed_sky", "drift", "edge_displacement", "filter_ghosts", "fringes", "ghosts",
-    "group_noise", "hot_pixels", "illumination", "injection_noise", "intra_pixel", "ipc", "lamp_response",
+    "dark_map", "detector_crosstalk", "dispersed_sky", "drift", "edge_displacement", "filter_ghosts", "fringes",
+    "ghosts", "group_noise", "hot_pixels", "illumination", "injection_noise", "intra_pixel", "ipc", "lamp_response",
     "lens_ghosts", "macc", "nonlinearity", "output_gain", "parallel_cti", "parallel_loss", "persistence",
     "pixel_area", "pixel_response", "poisson", "quadrants", "ramp", "ramp_cosmic_rays", "ramp_nonlinearity",
     "read_noise", "readout_cosmic_rays", "readout_trail", "reset_level", "row_noise", "satellite_trails", "serial_cti",
@@ -254,8 +253,8 @@ class Request:
         does not depend on it.
     density : float
         Number of random points per arcmin2. Set on the command line.
-    band : str, optional
-        Passband whose area the random points cover, None for the only one. Set on the command line.
+    band : tuple of str
+        Passbands whose areas the random points cover, () for the only one. Set on the command line.
     magnitude : float, optional
         AB magnitude of the galaxies whose detection random points contain. Set on the command line.
     model : tuple of str
@@ -293,7 +292,7 @@ class Request:
     detectors: tuple[str, ...] = ()
     limit: int | None = None
     density: float = 30.0
-    band: str | None = None
+    band: tuple[str, ...] = ()
     magnitude: float | None = None
     model: tuple[str, ...] = ()
     extrapolate: bool = False

@@ -106,8 +106,8 @@ class Job:
     dry_run : callable, optional
         Function (lake, request, as_json) -> () that replaces `steps` if the option --dry-run is given. It prints a
         forecast, as JSON with the option --json. With None the job has no such options.
-    number_options, text_options : tuple of (str, str)
-        Names and help texts of options that replace fields of the request with a number or a text, such as `density`.
+    number_options : tuple of (str, str)
+        Names and help texts of options that replace fields of the request with a number, such as `density`.
     """
 
     name: str
@@ -117,7 +117,6 @@ class Job:
     integer_options: tuple[tuple[str, str], ...] = ()
     dry_run: Callable[[Path, Request, bool], Sequence[Step]] | None = None
     number_options: tuple[tuple[str, str], ...] = ()
-    text_options: tuple[tuple[str, str], ...] = ()
     flag_options: tuple[tuple[str, str], ...] = ()
 
 
@@ -205,7 +204,7 @@ def common_facts(request: Request, *sections: str) -> dict[str, Any]:
 def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
     text_form = argparse.RawTextHelpFormatter
     parser = Parser(prog=job.name, description=job.doc, epilog=f"truesky {__version__}", formatter_class=text_form)
-    other_options = job.integer_options, job.dry_run is not None, job.number_options, job.text_options, job.flag_options
+    other_options = job.integer_options, job.dry_run is not None, job.number_options, job.flag_options
     add_job_arguments(parser, job.list_options, *other_options)
     return parser.parse_args(argv)
 
@@ -229,7 +228,7 @@ def _request(job: Job, options: argparse.Namespace) -> Request:
     given = {name: value for name, value in vars(options).items() if value is not None}
     lists = [name for name, _ in job.list_options if name in given]
     overrides: dict[str, Any] = {name: tuple(dict.fromkeys(given[name])) for name in lists}
-    single_options = (*job.integer_options, *job.number_options, *job.text_options)
+    single_options = (*job.integer_options, *job.number_options)
     overrides |= {name: given[name] for name, _ in single_options if name in given}
     overrides |= {name: True for name, _ in job.flag_options if given[name]}
     return replace(parse(Path(options.request)), **overrides)

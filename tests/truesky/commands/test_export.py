@@ -9,6 +9,7 @@ from tests.truesky.survey_maps import planned
 from truesky.catalogue.exports import euclid, fits_files, gaia_archive, skycatalogs
 from truesky.command_line import exports
 from truesky.commands import __main__ as truesky
+from truesky.render import grisms
 from truesky.survey_maps import depth_lookup, euclid_maps, healsparse_files
 
 
@@ -26,6 +27,7 @@ def calls(tmp_path, monkeypatch):
         (gaia_archive, "write", 1200),
         (healsparse_files, "write", ["a.hsp"]),
         (euclid_maps, "write", "a.fits"),
+        (grisms, "write", 12),
     ):
         label = f"{module.__name__.rpartition('.')[2]}.{name}"
         monkeypatch.setattr(module, name, lambda *given, _label=label, _result=result: called.append(_label) or _result)
@@ -42,6 +44,7 @@ WRITERS = {
     ("gaia", "ldac"): "gaia_archive.write",
     ("depth", "healsparse"): "healsparse_files.write",
     ("depth", "euclid"): "euclid_maps.write",
+    ("grisms", "grismconf"): "grisms.write",
 }
 
 
@@ -49,10 +52,12 @@ def test_every_form_has_its_writer(calls, tmp_path):
     assert [*WRITERS] == [(what, form) for what, forms in exports.FORMS.items() for form in forms]
     for (what, form), writer in WRITERS.items():
         out = tmp_path / f"{what}_{form}"
-        assert truesky.main(["export", what, str(tmp_path), "--form", form, "--out", str(out)]) == 0
+        more = ["--exposure", "3"] if what == "grisms" else []
+        assert truesky.main(["export", what, str(tmp_path), "--form", form, "--out", str(out), *more]) == 0
         assert calls.pop() == writer
     for what, forms in exports.FORMS.items():
-        assert truesky.main(["export", what, "--lake", str(tmp_path), "--out", str(tmp_path / f"{what}_x")]) == 0
+        where = [] if what == "grisms" else ["--lake", str(tmp_path)]
+        assert truesky.main(["export", what, *where, "--out", str(tmp_path / f"{what}_x")]) == 0
         assert calls.pop() == WRITERS[what, forms[0]]
 
 
@@ -72,6 +77,7 @@ def test_left_out_galaxies_are_counted(calls, tmp_path, capsys):
         (["gaia", "--form", "lda"], '--form lda: gaia can be written as table, ldac; did you mean "ldac"?'),
         (["galaxies", "--epoch", "2020"], "--epoch is an option of gaia only"),
         (["stars", "--bands", "lsst_r"], "--bands and --columns are options of depth only"),
+        (["stars", "--detectors", "DET11"], "--exposure and --detectors are options of grisms only"),
         (["gaia", "--form", "ldac", "--release", "dr3"], "--release is an option of gaia as a table only"),
     ],
 )
@@ -79,6 +85,11 @@ def test_other_combinations_are_one_line(words, said, tmp_path, capsys):
     assert truesky.main(["export", words[0], str(tmp_path), *words[1:], "--out", str(tmp_path / "x")]) == 2
     assert capsys.readouterr().err == f"truesky export: {said}\n"
     assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_lake_is_one_line(tmp_path, capsys):
+    assert truesky.main(["export", "stars", "--out", str(tmp_path / "x")]) == 2
+    assert capsys.readouterr().err == "truesky export: LAKE is missing: write truesky export stars LAKE --out PATH\n"
 
 
 def test_an_address_of_object_storage_does_not_become_a_local_folder(tmp_path, monkeypatch, capsys):

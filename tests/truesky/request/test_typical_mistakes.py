@@ -361,7 +361,7 @@ MISTAKES = {
     "a quadrant with an unknown gain": (
         section("mission.overrides", '"vis.gain@3-4.E" = { value = nan, unit = "electron / adu" }'),
         "mission.overrides.vis.gain@3-4.E.value = nan",
-        "is outside",
+        "is not a finite number",
     ),
     "ageing that is negative": (
         section("mission.overrides", '"vis.cti.age_growth" = { value = -0.1, unit = "1 / yr" }'),

@@ -60,7 +60,7 @@ def write(
     """
     user_files.check_target(path, FORMS[form])
     if epoch is not None and not 1900.0 <= epoch <= 2100.0:
-        raise BadInput(f"epoch {epoch:g} is not in [1900, 2100]")
+        raise BadInput(f"--epoch {epoch:g}: give a year from 1900 to 2100")
     version = read.version(lake, "gaia", request=request)
     tables = (_release_columns(version, partition, epoch) for partition in version.partitions)
     if form == "ldac":

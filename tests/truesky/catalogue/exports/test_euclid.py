@@ -102,6 +102,15 @@ def test_galaxies_are_read_back_without_change(lake, written):
     assert np.count_nonzero(values["flux_halpha"] == 0.0) > 0
 
 
+def test_the_shear_has_the_signs_that_euclids_validation_expects(lake, written):
+    """It compares -GAMMA1 and GAMMA2 with shears in axes west and north; ours have axes east and north."""
+    rows, found = exported_rows(lake, written)
+    west_north = rows["gamma1"].to_numpy(), -rows["gamma2"].to_numpy()
+    assert np.array_equal(-found["GAMMA1"], west_north[0])
+    assert np.array_equal(found["GAMMA2"], west_north[1])
+    assert found["GAMMA1"].min() < 0.0 < found["GAMMA1"].max()
+
+
 def test_ingested_galaxies_have_the_fluxes_of_the_file(lake, written, tmp_path, monkeypatch):
     """End to end: spectra, dust, lines, magnification and extinction come back as the same light in every band."""
     from truesky.catalogue.external import ingest
