@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,11 @@ from lake_schema import ids
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import OutOfRange
 from lake_schema.fits.images import Card
-from truesky.emulator import features, ideal_masters, matching
+from truesky.emulator import features, matching
 from truesky.emulator.examples import Examples, Outcomes
 from truesky.emulator.features import Features
 from truesky.randomness import rng
-from truesky.reduction import catalogue, files
+from truesky.reduction import catalogue, files, ideal_masters
 from truesky.reduction.calibration import COSMIC_RAY, HOT, NO_DATA, RESPONSE, SATURATED, UNSURE, ReducedImage
 from truesky.reduction.catalogue import Limits
 from truesky.reduction.frames import Frame
@@ -330,10 +331,10 @@ def _calibrate(frame: Frame, folder: Path | None) -> tuple[ReducedImage, tuple[C
     if folder is not None:
         read = nisp.read_masters if frame.scene.ramp else files.read_masters
         return reduce_frame(frame, read(folder, frame, ()), options)
-    kinds = files.master_kinds(frame) + (("fringes",) if "fringes" in frame.applied else ())
     _, variance = _blank_sky(frame)
-    masters = ideal_masters.known_masters(frame, kinds, variance)
-    return reduce_frame(frame, masters, replace(options, without=(*kinds, *options.without)))
+    masters = ideal_masters.ideal_masters(frame, math.sqrt(variance))
+    without = (*ideal_masters.replaced_kinds(frame), *options.without)
+    return reduce_frame(frame, masters, replace(options, without=without))
 
 
 def _blank_sky(frame: Frame) -> tuple[float, float]:

@@ -13,22 +13,18 @@ import numpy as np
 from scipy import ndimage
 
 from lake_schema import sky
-from lake_schema.arrays import Array, Bool, Float, Float32, Int
+from lake_schema.arrays import Array, Bool, Float, Int
 from lake_schema.tables.survey.depth import ORDER
-from truesky.randomness.rng import stream
 from truesky.reduction import calibration
 from truesky.reduction.calibration import Masters, ReducedImage, SkyMesh
-from truesky.reduction.combining import CombinedFrame
 from truesky.reduction.frames import Frame
+from truesky.reduction.ideal_masters import ideal_masters
 from truesky.reduction.infrared import nisp
 from truesky.reduction.infrared.ramps import Estimator
 from truesky.render.camera import astrometry
 from truesky.render.channels import registry
-from truesky.render.effects.charge import dark_current, dark_map, pixel_borders, pixel_response
-from truesky.render.effects.effect import Effect
 from truesky.render.effects.light import pixel_area
 from truesky.render.effects.readout import ramp_noise
-from truesky.render.exposure.rendered_detector import random_identity
 
 # A pixel of the map is bad if at least this fraction of its area is on bad pixels of the detector (assumed).
 BAD_FRACTION = 0.01
@@ -79,15 +75,13 @@ class FrameNoise:
     saturated: Int
 
 
-def measure(frame: Frame, seed: int, hits: Bool | None = None) -> FrameNoise:
+def measure(frame: Frame, hits: Bool | None = None) -> FrameNoise:
     """Measure the sky, the noise and the bad pixels of a frame.
 
     Parameters
     ----------
     frame : Frame
         A raw frame of the sky in a passband.
-    seed : int
-        Seed of the simulation, which determines the response and the dark current of each pixel.
     hits : bool array, shape (ny, nx), optional
         Pixels of a CCD that cosmic rays hit, which are not good. In a NISP frame its quality flags mark them.
 
@@ -102,7 +96,8 @@ def measure(frame: Frame, seed: int, hits: Bool | None = None) -> FrameNoise:
     the sky and the bias of columns. For NISP, it is multiplied by the predicted ratio of the variances without and with
     interpixel capacitance, which smooths photon noise as it smooths sources.
     """
-    masters = ideal_masters(frame, seed)
+    # A hot pixel has more variance by its dark current alone than a normal pixel.
+    masters = ideal_masters(frame, frame.scene.pixel_noise**2)
     known_bad = masters.flags
     image = calibrate(frame, masters)
     del masters
@@ -130,51 +125,6 @@ def measure(frame: Frame, seed: int, hits: Bool | None = None) -> FrameNoise:
         bad[counts * share >= BAD_FRACTION],
         np.unique(_map_pixels(system, saturated)),
     )
-
-
-def ideal_masters(frame: Frame, seed: int) -> Masters:
-    """Return the true response and dark current of each pixel as masters without noise.
-
-    Parameters
-    ----------
-    frame : Frame
-        A raw frame.
-    seed : int
-        Seed of the simulation.
-
-    Returns
-    -------
-    Masters
-        The masters. Pixels with a response far from 1 have the flag RESPONSE. Pixels whose dark current alone has
-        more variance than a normal pixel have the flag HOT.
-    """
-    scene = frame.scene
-    shape = (scene.ny, scene.nx)
-
-    def pattern(effects: tuple[Effect, ...], start: float) -> Float:
-        out = np.full(shape, start)
-        for effect in effects:
-            if effect.name in frame.applied:
-                rng = stream(*random_identity(effect, frame.exposure, frame.detector, seed))
-                out = effect.apply(out, *effect.parameters(scene), rng=rng)
-        return out
-
-    response = pattern((pixel_response.EFFECT, pixel_borders.RINGS), 1.0)
-    # The dark current of a CCD is equal in all normal pixels; the map of NISP contains it.
-    mean_dark = scene.dark_electrons if dark_current.EFFECT.name in frame.applied else 0.0
-    dark = pattern((dark_map.EFFECT, dark_current.HOT), mean_dark)
-    hot = dark - scene.dark_electrons > scene.pixel_noise**2
-    flags = np.where(calibration.is_bad_response(response), calibration.RESPONSE, 0).astype(np.uint8)
-    flags |= np.where(hot, calibration.HOT, 0).astype(np.uint8)
-    zero = calibration.neutral_master(shape, nisp.declared_nonlinearity(frame) if scene.ramp else 0.0)
-    return Masters(
-        zero, _master(dark / max(scene.exposure_time_s, 1e-9), zero), _master(response, zero, scene.ramp != ""), flags
-    )
-
-
-def _master(values: Float, neutral: CombinedFrame, vignetted: bool = False) -> CombinedFrame:
-    single: Float32 = values.astype(np.float32)
-    return CombinedFrame(single, neutral.uncertainty, neutral.count, vignetted)
 
 
 def calibrate(frame: Frame, masters: Masters) -> ReducedImage:

@@ -80,7 +80,7 @@ def measure_frame(lake: Path, facts: Json) -> Output:
     assert detector is not None
     (sky,), (variance,) = exposure_noise.variances([frame.exposure], [detector], frame.scene.mission)
     hits = _read_hits(source, rows["cosmic_rays"]["path"], variance) if _has_hits(frame, rows) else None
-    noise = frame_noise.measure(frame, products.manifest["facts"]["request"]["seed"], hits)
+    noise = frame_noise.measure(frame, hits)
     missing = np.array([not np.isfinite(noise.sky) or not np.isfinite(noise.variance) or noise.good == 0.0])
     columns = {
         **{name: [row[name]] for name in ("exposure_id", "detector", "channel", "band")},

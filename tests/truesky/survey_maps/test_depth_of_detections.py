@@ -7,6 +7,7 @@ import scipy
 from lake_schema.mission.configuration import resolve
 from lake_schema.tables.exposures import ExposureRow
 from truesky.fluxes import passbands
+from truesky.reduction.ideal_masters import ideal_masters
 from truesky.render.camera import detectors
 from truesky.render.channels import registry
 from truesky.render.plan_exposures import plan
@@ -128,8 +129,8 @@ def test_half_of_the_stars_at_the_depth_are_found_in_a_rendered_frame(channel, c
     stars = (x, y), frames.magnitudes_to_flux(magnitude)
     frame, one = frames.rendered(tmp_path, exposure, detector, stars, truth=("cosmic_rays",))
     hits = one.maps["cosmic_rays"] > np.sqrt(variance) if channel != "NISP-P" else None
-    found = frame_noise.measure(frame, frames.SEED, hits)
-    image = frame_noise.calibrate(frame, frame_noise.ideal_masters(frame, frames.SEED))
+    found = frame_noise.measure(frame, hits)
+    image = frame_noise.calibrate(frame, ideal_masters(frame, frame.scene.pixel_noise**2))
     used = (image.weight > 0.0) & (True if hits is None else ~hits)
     # The mean sky without the wings of the stars, of which a real field has fewer.
     noise = image.image - one.noise_free

@@ -9,6 +9,7 @@ from lake_schema.mission.configuration import resolve
 from lake_schema.tables.survey.depth import ORDER
 from truesky.reduction import calibration
 from truesky.reduction.calibration import ReducedImage, SkyMesh
+from truesky.reduction.ideal_masters import ideal_masters
 from truesky.render.camera import astrometry
 from truesky.survey_maps import exposure_noise, frame_noise
 
@@ -91,7 +92,7 @@ def ground(tmp_path_factory):
     detector = frames.section("lsstcam", "R22_S11", SIDE, mission)
     stars = ((np.array([300.0]), np.array([200.0])), frames.magnitudes_to_flux([14.0]))
     frame, one = frames.rendered(folder, exposure, detector, stars, mission)
-    return frame, one, frame_noise.measure(frame, frames.SEED)
+    return frame, one, frame_noise.measure(frame)
 
 
 def test_noise_of_a_ground_frame_is_that_of_the_plan(ground):
@@ -108,7 +109,7 @@ def test_noise_of_a_ground_frame_is_that_of_the_plan(ground):
 def test_dark_columns_are_bad_pixels_of_the_map(ground):
     """A pixel of the map is 64 pixels wide, so that a dark column takes 1.6 % of it, or less near its ends."""
     frame, _, found = ground
-    bad = calibration.is_bad_response(frame_noise.ideal_masters(frame, frames.SEED).flat.mean)
+    bad = calibration.is_bad_response(ideal_masters(frame, frame.scene.pixel_noise**2).flat.mean)
     y, x = np.nonzero(bad)
     system = astrometry.from_cards(frame.cards)
     place, number = np.unique(sky.cell_at(*astrometry.sky_of_pixel(system, x, y), ORDER), return_counts=True)
@@ -122,7 +123,7 @@ def test_dark_columns_are_bad_pixels_of_the_map(ground):
 def test_dark_columns_of_the_response_are_dark_in_the_frame(ground):
     """The known response is that of the frame: pixels nearly without response have little of the sky."""
     frame, _, _ = ground
-    response = frame_noise.ideal_masters(frame, frames.SEED).flat.mean
+    response = ideal_masters(frame, frame.scene.pixel_noise**2).flat.mean
     electrons = frame.electrons()
     sky_electrons = np.median(electrons)
     dark = response < 0.1
@@ -141,7 +142,7 @@ def test_hit_pixels_are_not_good(ground):
     frame, _, found = ground
     hits = np.zeros((SIDE, SIDE), bool)
     hits[:, :64] = True
-    again = frame_noise.measure(frame, frames.SEED, hits)
+    again = frame_noise.measure(frame, hits)
     assert again.good == pytest.approx(found.good - 64 / SIDE, abs=0.01)
     assert again.variance == pytest.approx(found.variance, rel=0.02)
 
@@ -158,7 +159,7 @@ def test_noise_of_a_frame_is_that_of_the_plan(channel, camera, name, tmp_path):
     exposure = frames.exposures(tmp_path / "plan")[channel]
     detector = frames.section(camera, name, 1024)
     frame, _ = frames.rendered(tmp_path, exposure, detector)
-    found = frame_noise.measure(frame, frames.SEED)
+    found = frame_noise.measure(frame)
     (level,), (variance,) = exposure_noise.variances([exposure], [detector], frames.MISSION)
     assert found.sky == pytest.approx(level, rel=0.003)
     assert found.variance == pytest.approx(variance, rel=0.015)
@@ -168,7 +169,7 @@ def test_a_frame_that_a_star_fills_has_no_noise(ground):
     """A frame without blank sky has no measured sky; its depth stays that of the plan."""
     frame, _, _ = ground
     hits = np.ones((SIDE, SIDE), bool)
-    found = frame_noise.measure(frame, frames.SEED, hits)
+    found = frame_noise.measure(frame, hits)
     assert np.isnan([found.sky, found.variance]).all()
     assert found.good == 0.0
     assert found.blank == 0

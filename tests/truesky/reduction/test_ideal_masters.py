@@ -9,10 +9,10 @@ from lake_schema.store import layout, publish, read
 from tests import requests
 from tests.truesky.render.test_render_exposures_calibration import small_detectors
 from tests.truesky.render.test_render_exposures_infrared import MODULES
-from truesky.emulator import frame_examples, ideal_masters, train
+from truesky.emulator import frame_examples, train
 from truesky.emulator.frame_examples import Settings
 from truesky.randomness.rng import stream
-from truesky.reduction import files
+from truesky.reduction import files, ideal_masters
 from truesky.reduction.calibration import HOT, RESPONSE
 from truesky.reduction.infrared import nisp
 from truesky.render.effects.charge import dark_map, pixel_response
@@ -66,9 +66,10 @@ def ramp(tmp_path_factory):
     return render(tmp_path_factory.mktemp("ramp"), RAMP)
 
 
-def constant_masters(frame, without, variance):
-    """Replace `ideal_masters.known_masters`: masters that know no pattern."""
-    return (nisp.read_masters if frame.scene.ramp else files.read_masters)(Path(), frame, without)
+def constant_masters(frame, hot_electrons):
+    """Replace `ideal_masters.ideal_masters`: masters that know no pattern."""
+    read = nisp.read_masters if frame.scene.ramp else files.read_masters
+    return read(Path(), frame, ideal_masters.replaced_kinds(frame))
 
 
 def correlation(values, response):
@@ -116,7 +117,7 @@ def test_hot_pixels_of_a_ramp_give_no_detections(ramp, monkeypatch):
         measured = frame_examples.measure(frame, sources, Settings(), noise_free=path)
         assert measured.conditions["unmatched"] < 4
         assert measured.examples.outcomes.detected.sum() == 2
-    monkeypatch.setattr(ideal_masters, "known_masters", constant_masters)
+    monkeypatch.setattr(ideal_masters, "ideal_masters", constant_masters)
     assert frame_examples.measure(frame, sources, Settings()).conditions["unmatched"] >= 8
 
 
@@ -126,7 +127,7 @@ def test_hot_pixels_are_those_whose_dark_current_exceeds_the_noise(ramp):
         np.zeros((frame.scene.ny, frame.scene.nx)), *dark_map.EFFECT.parameters(frame.scene),
         rng=stream(SEED, "nisp", "DET22", dark_map.EFFECT.name),
     )  # fmt: skip
-    masters = ideal_masters.known_masters(frame, files.master_kinds(frame), 100.0)
+    masters = ideal_masters.ideal_masters(frame, 10.0)
     assert masters.dark.mean * frame.scene.exposure_time_s == pytest.approx(drawn, rel=1e-5, abs=0)
     is_hot = drawn - np.median(drawn) > 10.0
     assert ((masters.flags & HOT != 0) == is_hot).all()
