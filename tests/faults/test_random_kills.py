@@ -44,7 +44,7 @@ camera = "decam"
 band = "des_r"
 ra = 53.117
 dec = -27.808
-centre_on = "S1"
+centre_on = "N1"
 detectors = ["S1", "N1"]
 mjd = 60905.0
 """
