@@ -99,6 +99,7 @@ def test_mutations_are_reproducible():
         ("path", 9385),
         ("pointings", 865),
         ("pointings", 1436),
+        ("pointings", 1856),
         ("Tycho-2", 17636),
         ("cache, array", 28),
         ("cache, array", 176),

@@ -325,10 +325,15 @@ def sun_longitude(mjd: float) -> float:
 
     The error is 0.02 deg between 1950 and 2050.
     """
+    return float(sun_longitudes(np.array(mjd)))
+
+
+def sun_longitudes(mjd: Float) -> Float:
+    """Return the longitude of `sun_longitude` for an array of dates (MJD) of any shape."""
     days = mjd - _MJD_J2000
     longitude = _SUN_LONGITUDE[0] + (_SUN_LONGITUDE[1] - _PRECESSION) * days
     anomaly = np.radians(_SUN_ANOMALY[0] + _SUN_ANOMALY[1] * days)
-    return float((longitude + _SUN_CENTRE[0] * np.sin(anomaly) + _SUN_CENTRE[1] * np.sin(2 * anomaly)) % 360.0)
+    return np.asarray((longitude + _SUN_CENTRE[0] * np.sin(anomaly) + _SUN_CENTRE[1] * np.sin(2 * anomaly)) % 360.0)
 
 
 def zodiacal_intensity(from_sun: float, latitude: float, mission: MissionConfiguration) -> float:

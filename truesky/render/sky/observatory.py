@@ -11,7 +11,7 @@ from lake_schema.arrays import Bool, Float
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.sky import separation
 from lake_schema.sky.ecliptic import equatorial
-from truesky.render.sky.diffuse_light import sun_longitude
+from truesky.render.sky.diffuse_light import sun_longitude, sun_longitudes
 
 # MJD of the epoch J2000.
 _MJD_J2000 = 51544.5
@@ -54,6 +54,8 @@ LOWEST_ALTITUDE = 19.3168
 _STEP = 1.0 / 96.0
 # Number of days after the earliest date in which dark time is searched.
 _DAYS = 400
+# Number of days of which the transits are searched together.
+_BLOCK = 25
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +151,7 @@ class Site:
 
 def sun_altitude(mjd: npt.ArrayLike, site: Site) -> Float:
     """Return the altitude of the Sun above the horizon of an observatory in degrees, for an array of dates (MJD)."""
-    sun = _sun_longitudes(np.asarray(mjd, float))
+    sun = sun_longitudes(np.asarray(mjd, float))
     return site.altitude(*equatorial(sun, np.zeros_like(sun)), mjd)
 
 
@@ -240,7 +242,7 @@ def moon_position(mjd: npt.ArrayLike) -> tuple[Float, Float, Float]:
 
     longitude = _MOON_MEAN[0] + _MOON_MEAN[1] * century + sum_series(_MOON_LONGITUDE) - _PRECESSION * century
     latitude = sum_series(_MOON_LATITUDE)
-    sun = _sun_longitudes(np.asarray(mjd, float))
+    sun = sun_longitudes(np.asarray(mjd, float))
     elongation = np.degrees(np.arccos(np.cos(np.radians(latitude)) * np.cos(np.radians(longitude - sun))))
     ra, dec = equatorial(longitude % 360.0, latitude)
     return ra, dec, 180.0 - elongation
@@ -249,13 +251,22 @@ def moon_position(mjd: npt.ArrayLike) -> tuple[Float, Float, Float]:
 def moon_altitude(mjd: npt.ArrayLike, site: Site) -> Float:
     """Return the altitude of the Moon above the horizon in degrees, corrected for parallax, for an array of MJD."""
     ra, dec, _ = moon_position(mjd)
+    return _moon_altitude_at(ra, dec, mjd, site)
+
+
+def _moon_altitude_at(ra: Float, dec: Float, mjd: npt.ArrayLike, site: Site) -> Float:
+    """Return the altitude of the Moon, degrees, from its geocentric position."""
     high = site.altitude(ra, dec, mjd)
     return np.asarray(high - _PARALLAX * np.cos(np.radians(high)))
 
 
 def moon_lit_fraction(mjd: npt.ArrayLike) -> Float:
     """Return the illuminated fraction of the Moon's disc, from 0 (new) to 1 (full), for an array of dates (MJD)."""
-    return np.asarray(0.5 * (1.0 + np.cos(np.radians(moon_position(mjd)[2]))))
+    return _lit_fraction(moon_position(mjd)[2])
+
+
+def _lit_fraction(phase_angle: Float) -> Float:
+    return np.asarray(0.5 * (1.0 + np.cos(np.radians(phase_angle))))
 
 
 def next_dark_time(ra: float, dec: float, start: float, site: Site, max_moon: float) -> float:
@@ -314,14 +325,13 @@ def next_dark_transit(ra: float, dec: float, start: float, site: Site, max_moon:
     """
     first = (-float(site.hour_angle(ra, start)) / (2.0 * np.pi)) % 1.0
     transits = start + (first + np.arange(float(_DAYS))) / _TURNS_A_DAY
-    hours_around = [_is_dark(ra, dec, transits + hours / 24.0, site, max_moon) for hours in (-1.0, 0.0, 1.0)]
-    is_dark = np.all(hours_around, axis=0)
-    return float(transits[np.argmax(is_dark)]) if is_dark.any() else start
-
-
-def _sun_longitudes(mjd: Float) -> Float:
-    """Return the ecliptic longitudes of the Sun in degrees, in an array with the shape of the dates (MJD)."""
-    return np.array([sun_longitude(float(t)) for t in mjd.ravel()]).reshape(mjd.shape)
+    # A table may have thousands of fields without a date, and most find one within a few months.
+    for block in np.array_split(transits, _DAYS // _BLOCK):
+        hours_around = [_is_dark(ra, dec, block + hours / 24.0, site, max_moon) for hours in (-1.0, 0.0, 1.0)]
+        is_dark = np.all(hours_around, axis=0)
+        if is_dark.any():
+            return float(block[np.argmax(is_dark)])
+    return start
 
 
 def _is_observable(ra: float, dec: float, mjd: Float, site: Site, max_moon: float) -> Bool:
@@ -336,7 +346,7 @@ def _is_dark(ra: float, dec: float, mjd: Float, site: Site, max_moon: float) -> 
     night = sun_altitude(mjd, site) < _TWILIGHT
     if not night.any():
         return night
-    moon_ra, moon_dec, _ = moon_position(mjd)
+    moon_ra, moon_dec, phase_angle = moon_position(mjd)
     away = separation(np.full(len(mjd), ra), np.full(len(mjd), dec), moon_ra, moon_dec) > _FROM_MOON
-    is_faint = away & (moon_lit_fraction(mjd) <= max_moon)
-    return np.asarray(night & (is_faint | (moon_altitude(mjd, site) < _MOON_SET)))
+    is_faint = away & (_lit_fraction(phase_angle) <= max_moon)
+    return np.asarray(night & (is_faint | (_moon_altitude_at(moon_ra, moon_dec, mjd, site) < _MOON_SET)))
