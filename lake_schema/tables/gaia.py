@@ -109,6 +109,21 @@ GAIA = Table(
     max_order=8,
 )
 
+VARIABLE, NOT_AVAILABLE = "VARIABLE", "NOT_AVAILABLE"
+VARIABLE_FLAG = Column(
+    "phot_variable_flag",
+    "string",
+    "",
+    "meta.code;src.var",
+    f"{VARIABLE} for variable stars, {NOT_AVAILABLE} for others; the column exists only with universe.variables",
+)
+
+
+def with_variable_flag(table: Table) -> Table:
+    """Return the declaration of `GAIA`, `EXPORT` or `EXPORT_DR3` with the column of variable stars at its end."""
+    return replace(table, columns=(*table.columns, VARIABLE_FLAG))
+
+
 PARAMETERS = ("ra", "dec", "parallax", "pmra", "pmdec")
 
 

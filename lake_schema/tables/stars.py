@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from lake_schema.columns import Column, Table
 from lake_schema.tables.common import DEC, HEALPIX_29, RA, density_boost_column, id_of_kinds
 
@@ -27,6 +29,93 @@ def _template_columns(k: int) -> tuple[Column, ...]:
                mantissa_bits=12),
     )  # fmt: skip
 
+
+# Types of variable stars in the column `variability`, which is null for constant stars.
+VARIABILITY = (
+    (1, "RR Lyrae, fundamental mode (RRab)"),
+    (2, "RR Lyrae, first overtone (RRc)"),
+    (3, "classical Cepheid"),
+    (4, "Mira"),
+    (5, "semi-regular giant"),
+    (6, "binary with eclipses"),
+    (7, "close binary without eclipses, with tides"),
+)
+_OPTIONAL = "; the column exists only with universe.variables"
+# Columns of variable stars; all are null for constant stars.
+VARIABILITY_COLUMNS = (
+    Column(
+        "variability",
+        "int8",
+        "",
+        "meta.code.class;src.var",
+        f"type of a variable star, null for a constant one{_OPTIONAL}",
+        1,
+        7,
+        True,
+        VARIABILITY,
+    ),
+    Column("period", "float64", "d", "time.period", f"period of the pulsation or orbit{_OPTIONAL}", 0.01, 1e9, True),
+    Column(
+        "epoch",
+        "float64",
+        "d",
+        "time.epoch",
+        f"MJD of a maximum of light of a pulsating star, or of the middle of an eclipse of this star{_OPTIONAL}",
+        5e4,
+        1.1e9,
+        True,
+    ),
+    Column(
+        "amplitude",
+        "float32",
+        "mag",
+        "src.var.amplitude;em.opt.V",
+        f"difference between minimum and maximum of the star's own light in Johnson V{_OPTIONAL}",
+        0.0,
+        15.0,
+        True,
+    ),
+    Column(
+        "eclipse_radius_ratio",
+        "float32",
+        "",
+        "phys.size.radius;arith.ratio",
+        f"radius of the star that eclipses this star, in radii of this star; 0 without eclipses{_OPTIONAL}",
+        0.0,
+        1e5,
+        True,
+    ),
+    Column(
+        "eclipse_impact",
+        "float32",
+        "",
+        "pos.angDistance;arith.ratio",
+        f"distance of the centres on the sky in the middle of the eclipse, in radii of this star{_OPTIONAL}",
+        0.0,
+        1e5,
+        True,
+    ),
+    Column(
+        "eclipse_duration",
+        "float32",
+        "d",
+        "time.duration",
+        f"time from the first to the last contact of the eclipse; 0 without eclipses{_OPTIONAL}",
+        0.0,
+        1e6,
+        True,
+    ),
+    Column(
+        "tidal_amplitude",
+        "float32",
+        "",
+        "src.var.amplitude;arith.ratio",
+        f"relative semi-amplitude of the flux by tides; its minima are at the epoch and half a period later{_OPTIONAL}",
+        0.0,
+        0.2,
+        True,
+    ),
+)
 
 STARS = Table(
     "stars",
@@ -115,3 +204,8 @@ STARS = Table(
     order=3,
     max_order=8,
 )
+
+
+def stars(variables: bool) -> Table:
+    """Return the declaration of table `stars`, with the columns of variable stars if `variables` is True."""
+    return replace(STARS, columns=STARS.columns + VARIABILITY_COLUMNS) if variables else STARS

@@ -15,7 +15,7 @@ from lake_schema.errors import BadInput
 from lake_schema.store import layout, read
 from lake_schema.store.plan import Json, Output, Plan, Task
 from lake_schema.store.provenance import code_version
-from lake_schema.tables.gaia import GAIA
+from lake_schema.tables.gaia import GAIA, with_variable_flag
 from truesky.catalogue.stars import gaia
 from truesky.request import universe
 from truesky.request.schema import Request
@@ -54,7 +54,8 @@ def steps(lake: Path, request: Request) -> list[Step]:
         raise BadInput("table star_fluxes was computed from another version of stars: run compute_fluxes first")
     facts = {"seed": request.seed, "stars": stars.key, "star_fluxes": fluxes.key, "code": code_version()}
     tasks = tuple(Task(name, {"part": name}) for name in stars.partitions)
-    return [Step(Plan(GAIA, facts, tasks), observe_stars)]
+    declared = with_variable_flag(GAIA) if "variability" in stars.schema.names else GAIA
+    return [Step(Plan(declared, facts, tasks), observe_stars)]
 
 
 def observe_stars(lake: Path, facts: Json) -> Output:
@@ -78,7 +79,9 @@ def observe_stars(lake: Path, facts: Json) -> Output:
     cell.
     """
     partition = facts["part"]
-    stars = _rows(read.version(lake, "stars", facts["stars"]), partition, gaia.STAR_COLUMNS)
+    version = read.version(lake, "stars", facts["stars"])
+    variable_columns = [name for name in gaia.VARIABLE_COLUMNS if name in version.schema.names]
+    stars = _rows(version, partition, [*gaia.STAR_COLUMNS, *variable_columns])
     fluxes = _rows(read.version(lake, "star_fluxes", facts["star_fluxes"]), partition, gaia.FLUX_COLUMNS)
     rows = gaia.observe(stars, fluxes, facts["seed"])
     first, last = sky.cell_range(*layout.cell_of_file(partition))

@@ -4,6 +4,7 @@ Command: spark-submit jobs/catalogue/build_stars.py --lake LAKE --request REQUES
 """
 
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from lake_schema.store.plan import Json, Output, Plan
 from lake_schema.store.provenance import code_version
+from lake_schema.tables import stars as declarations
 from lake_schema.tables.stars import STARS
 from truesky.catalogue import cells, dust_map, given_sources, request_checks
 from truesky.catalogue.stars import stars
@@ -56,10 +58,13 @@ def steps(lake: Path, request: Request) -> list[Step]:
         **dust_map.facts(request.ingest.dust),
         "code": code_version(),
     }
+    if request.universe.variables:
+        facts["variables"] = True
     generation_cells = request.area.cells()
     numbers = stars.expected_counts(generation_cells, request_checks.star_model(facts["star_limit"], choice, facts))
     tasks = cells.tasks_by_row_count(generation_cells, numbers, choice.rows_a_file, _MIN_FILE_ORDER)
-    return [Step(Plan(STARS, facts, tasks), partial(draw_stars, choice=choice, user_dust_map=request.ingest.dust))]
+    plan = Plan(declarations.stars(request.universe.variables), facts, tasks)
+    return [Step(plan, partial(draw_stars, choice=choice, user_dust_map=request.ingest.dust))]
 
 
 def _given_step(request: Request, source_tables: UserSources) -> Step:
@@ -135,9 +140,11 @@ def draw_stars(lake: Path, facts: Json, choice: Stars, user_dust_map: DustMap | 
     Output
         Rows of table `stars`.
     """
-    model = request_checks.star_model(facts["star_limit"], choice, facts)
+    has_variables = facts.get("variables", False)
+    model = replace(request_checks.star_model(facts["star_limit"], choice, facts), variables=has_variables)
     dust = dust_map.map_for_request(facts["seed"], user_dust_map)
-    return Output(cells.draw_rows(facts, STARS, lambda cell: stars.draw(cell, facts["seed"], model, dust)))
+    table = declarations.stars(has_variables)
+    return Output(cells.draw_rows(facts, table, lambda cell: stars.draw(cell, facts["seed"], model, dust)))
 
 
 JOB = Job("build_stars", "Draw the Milky Way's stars of a sky area.", steps)

@@ -112,8 +112,8 @@ def draw(tracks: Tracks, track: Int, mass: Float, rng: np.random.Generator) -> C
     return Companions(has_companion, 10.0**second, m_h, 10.0**log_teff, log_g)
 
 
-def projected_offsets(primary: Float, companion: Float, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Draw the projected offsets of companions from their primaries.
+def draw_orbits(primary: Float, companion: Float, rng: np.random.Generator) -> tuple[Float, Float, Float]:
+    """Draw the orbits of companions, and their projected offsets from their primaries.
 
     The separation is the drawn semi-major axis in a random direction in space; orbital phases are not drawn.
 
@@ -126,6 +126,8 @@ def projected_offsets(primary: Float, companion: Float, rng: np.random.Generator
 
     Returns
     -------
+    axis : float array, shape (n,)
+        Semi-major axes, AU.
     east, north : float array, shape (n,)
         Offsets of the companions on the sky, AU.
     """
@@ -138,7 +140,7 @@ def projected_offsets(primary: Float, companion: Float, rng: np.random.Generator
     of_dwarf = 10.0 ** (law["log_axis_dwarf"] + law["log_axis_dwarf_scatter"] * deviate)
     axis = np.minimum(np.where(primary < law["dwarf_below"], of_dwarf, of_sun), law["widest"])
     projected = axis * np.sqrt(1.0 - cosine**2)
-    return projected * np.sin(angle), projected * np.cos(angle)
+    return axis, projected * np.sin(angle), projected * np.cos(angle)
 
 
 @lru_cache(maxsize=1)

@@ -20,13 +20,15 @@ import pyarrow.compute as pc
 import scipy
 
 from lake_schema import sky, units
-from lake_schema.arrays import Float
-from lake_schema.tables.gaia import GAIA
+from lake_schema.arrays import Array, Float
+from lake_schema.tables.gaia import GAIA, NOT_AVAILABLE, VARIABLE, with_variable_flag
 from truesky.catalogue import parameters
 from truesky.randomness.rng import uniforms
 
 BANDS = ("gaia_g", "gaia_bp", "gaia_rp")
 STAR_COLUMNS = ["id", "ra", "dec", "distance", "pm_ra", "pm_dec"]
+# Columns of variable stars, which the table `stars` has if the request has variable stars.
+VARIABLE_COLUMNS = ("variability", "amplitude")
 FLUX_COLUMNS = [f"f_nu_{band}" for band in BANDS]
 _FILE = "gaia.toml"
 _MAS = 1.0 / 3.6e6
@@ -42,7 +44,7 @@ def observe(stars: pa.Table, fluxes: pa.Table, seed: int) -> pa.Table:
     Parameters
     ----------
     stars : Table
-        Rows of table `stars` with the columns STAR_COLUMNS.
+        Rows of table `stars` with the columns STAR_COLUMNS, and VARIABLE_COLUMNS if the table has them.
     fluxes : Table
         Rows of table `star_fluxes` for the same stars in the same order, with the columns FLUX_COLUMNS.
     seed : int
@@ -52,7 +54,7 @@ def observe(stars: pa.Table, fluxes: pa.Table, seed: int) -> pa.Table:
     -------
     Table
         Rows of table `gaia`, sorted by _healpix_29 (the order-29 cell of the measured position). Stars that Gaia does
-        not detect have no row.
+        not detect have no row. With VARIABLE_COLUMNS there is the column phot_variable_flag.
     """
     ids = stars["id"].to_numpy()
     chance = uniforms(ids, _COUNT, seed, "gaia")
@@ -66,8 +68,11 @@ def observe(stars: pa.Table, fluxes: pa.Table, seed: int) -> pa.Table:
     columns["ruwe"] = _ruwe(chance[_RUWE, listed])
     for k, (short, kind) in enumerate((("g", "g"), ("bp", "xp"), ("rp", "xp"))):
         columns |= _photometry(short, true_mags[k][listed], vega[k], kind, noise[_G + k])
+    declared = GAIA
+    if "variability" in stars.column_names:
+        declared, columns["phot_variable_flag"] = with_variable_flag(GAIA), _variable_flags(listed_stars)
     order = np.lexsort((columns["id"], columns["_healpix_29"]))
-    return GAIA.build({name: values[order] for name, values in columns.items()})
+    return declared.build({name: values[order] for name, values in columns.items()})
 
 
 def ab_minus_vega() -> tuple[float, ...]:
@@ -148,6 +153,12 @@ def _motion(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
 def _ruwe(chance: Float) -> Float:
     degrees = parameters.section(_FILE, "goodness")["degrees"]
     return np.asarray(np.sqrt(scipy.special.chdtri(degrees, chance) / degrees))
+
+
+def _variable_flags(stars: pa.Table) -> Array:
+    limit = parameters.section(_FILE, "variability")["min_amplitude"]
+    varies = pc.and_(pc.is_valid(stars["variability"]), pc.greater(pc.fill_null(stars["amplitude"], 0.0), limit))
+    return np.where(varies.to_numpy(), VARIABLE, NOT_AVAILABLE)
 
 
 def _photometry(short: str, true_ab: Float, vega: float, kind: str, noise: Float) -> dict[str, Any]:

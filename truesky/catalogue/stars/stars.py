@@ -21,9 +21,17 @@ from lake_schema import ids, sky
 from lake_schema.arrays import Bool, Float, Float32, Int
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
-from lake_schema.tables.stars import STARS
+from lake_schema.tables import stars as declarations
 from truesky.catalogue import dust_map, parameters
-from truesky.catalogue.stars import bright_stars, brown_dwarfs, companions, from_catalogue, kinematics, milky_way
+from truesky.catalogue.stars import (
+    bright_stars,
+    brown_dwarfs,
+    companions,
+    from_catalogue,
+    kinematics,
+    milky_way,
+    variables,
+)
 from truesky.catalogue.stars.bright_stars import BrightStars
 from truesky.catalogue.stars.brown_dwarfs import BrownDwarfs
 from truesky.catalogue.stars.from_catalogue import StarCatalogue
@@ -87,6 +95,8 @@ class StarModel:
         Index of the first template of the library that is a synthetic spectrum of a model atmosphere.
     v_minus_h : float array
         V - H (Vega) of the stellar types, then of the model atmospheres, mag.
+    variables : bool
+        True if the rows have the columns of variable stars.
     """
 
     limit: float
@@ -102,6 +112,7 @@ class StarModel:
     types: StellarTypes
     models: int
     v_minus_h: Float
+    variables: bool = False
 
 
 def model(
@@ -252,8 +263,9 @@ def draw(cell: int, seed: int, universe: StarModel, dust: Float32) -> pa.Table:
         lots.append(_tycho_stars(cell, universe.bright, universe.types))
         selections.append((lots[-1]["mag_h"] < limit) & (lots[-1]["mag_h"] >= universe.brightest))
     first = np.cumsum([0, *(len(lot["ra"]) for lot in lots)])
+    table = declarations.stars(universe.variables)
     tables = [
-        STARS.build(
+        table.build(
             {"id": ids.source_id(STAR, cell, start + np.flatnonzero(keep)), **{k: v[..., keep] for k, v in lot.items()}}
         )
         for start, lot, keep in zip(first[:-1], lots, selections, strict=True)
@@ -286,9 +298,9 @@ def _draw_model_stars(cell: int, seed: int, universe: StarModel, dust: Float32, 
     rng = stream(seed, "stars.companions", cell)
     secondaries = companions.draw(galaxy.tracks, stars.track, stars.mass, rng)
     primary = secondaries.primary
-    offset = companions.projected_offsets(stars.mass[primary], secondaries.mass, rng)
+    axis, *offset = companions.draw_orbits(stars.mass[primary], secondaries.mass, rng)
     companion_lot = {name: values[primary] for name, values in (place | common).items()}
-    companion_lot |= _companion_positions(cell, place, primary, offset)
+    companion_lot |= _companion_positions(cell, place, primary, (offset[0], offset[1]))
     companion_lot |= _spectrum_columns(
         universe,
         secondaries.m_h,
@@ -302,6 +314,9 @@ def _draw_model_stars(cell: int, seed: int, universe: StarModel, dust: Float32, 
         "mass": secondaries.mass,
         "companion_of": ids.source_id(STAR, cell, primary),
     }
+    if universe.variables:
+        light_curves = variables.columns(lot, companion_lot, (primary, axis), cell, seed)
+        lot, companion_lot = lot | light_curves[0], companion_lot | light_curves[1]
     return [lot | {"companion_of": bright_stars.masked_column(stars.age.size)}, companion_lot]
 
 

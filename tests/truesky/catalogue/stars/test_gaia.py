@@ -17,6 +17,7 @@ from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.gaia import EXPORT, GAIA
 from lake_schema.tables.stars import EPOCH, STARS
+from lake_schema.tables.stars import stars as star_table
 from tests import hats_readers
 from tests.universe import rows_of
 from truesky.catalogue import build_gaia, parameters
@@ -161,14 +162,14 @@ def edge_stars():
     return place[:, 0] % 360, place[:, 1]
 
 
-def filled(lake):
+def filled(lake, variables=False):
     ra, dec = edge_stars()
     index = sky.healpix_29(ra, dec)
     order = np.argsort(index)
     ra, dec, index = ra[order], dec[order], index[order]
     files = np.unique(index >> 48).tolist()
     assert len(files) >= 2
-    flux_table = fluxes("star", BANDS)
+    flux_table, declared = fluxes("star", BANDS), star_table(variables)
 
     def stars(root, facts):
         here = np.flatnonzero(index >> 48 == facts["cell"])
@@ -177,7 +178,10 @@ def filled(lake):
         given_columns["id"] = ids.source_id(5, facts["cell"] << 6, here)
         given_columns["distance"] = np.full(here.size, 1000.0)
         given_columns |= {"pm_ra": np.full(here.size, 3.0), "pm_dec": np.full(here.size, -7.0)}
-        return Output(STARS.build({name: rows[name] for name in STARS.names} | given_columns))
+        if variables:
+            given_columns |= {"variability": [1 if row % 2 else None for row in here]}
+            given_columns |= {"amplitude": [0.01 * (row % 4) if row % 2 else None for row in here]}
+        return Output(declared.build({name: rows[name] for name in STARS.names} | given_columns))
 
     def beside(root, facts):
         rows = read.version(root, "stars").rows(partitions=[layout.cell_file(5, facts["cell"])])
@@ -186,18 +190,19 @@ def filled(lake):
         return Output(flux_table.build({name: rows[name] for name in ("id", "ra", "dec", "_healpix_29")} | flux))
 
     parts = tuple(Task(layout.cell_file(5, cell), {"cell": cell}) for cell in files)
-    publish.make_version(lake, Plan(STARS, {"seed": asked().seed}, parts), stars)
+    seen = {"variables": True} if variables else {}
+    publish.make_version(lake, Plan(declared, {"seed": asked().seed, **seen}, parts), stars)
     publish.make_version(lake, Plan(flux_table, {"input": read.version(lake, "stars").key}, parts), beside)
     return index
 
 
-def asked():
+def asked(**universe):
     area = {"cone": {"ra": 10.0, "dec": 10.0, "radius": 1.0}}
-    return from_table({"name": "x", "seed": 7, "area": area, "fluxes": {"bands": BANDS}})
+    return from_table({"name": "x", "seed": 7, "area": area, "fluxes": {"bands": BANDS}, "universe": universe})
 
 
-def built(lake):
-    (step,) = build_gaia.steps(lake, asked())
+def built(lake, **universe):
+    (step,) = build_gaia.steps(lake, asked(**universe))
     publish.make_version(lake, step.plan, step.run_task)
     return read.version(lake, "gaia")
 
@@ -368,3 +373,26 @@ def test_ldac_as_scamp_names_it(lake, tmp_path):
     assert found["MAGERR"] == pytest.approx(1.0857 / rows["phot_g_mean_flux_over_error"].to_numpy(), rel=1e-4)
     assert set(found["OBSDATE"]) == {2015.5}
     assert exported([str(lake), "--out", str(tmp_path / "gaia.csv"), "--form", "ldac"]) == 2
+
+
+@pytest.mark.parametrize("release", ["dr2", "dr3"])
+def test_variable_stars_have_a_flag(lake, tmp_path, release):
+    """Every second star varies, by 0.01 or 0.03 mag. All other columns are those of constant stars."""
+    filled(lake)
+    constant = built(lake).rows()
+    filled(lake, variables=True)
+    rows = built(lake, variables=True).rows()
+    assert rows.column_names == [*constant.column_names, "phot_variable_flag"]
+    assert rows.select(constant.column_names).equals(constant)
+    number = rows["id"].to_numpy() >> ids.MEMBER_BITS
+    assert len(rows) > 1000
+    flags = np.where(number % 4 == 3, "VARIABLE", "NOT_AVAILABLE")
+    assert rows["phot_variable_flag"].to_pylist() == flags.tolist()
+    for path in (tmp_path / "gaia.csv", tmp_path / "gaia.fits"):
+        assert exported([str(lake), "--out", str(path), "--release", release]) == 0
+    table = fits.getdata(tmp_path / "gaia.fits", 1)
+    assert table.names[-1] == "phot_variable_flag"
+    assert table["phot_variable_flag"].tolist() == flags.tolist()
+    with open(tmp_path / "gaia.csv") as file:
+        assert next(file).strip().endswith('phot_variable_flag"')
+        assert flags[0] in next(file)
