@@ -17,7 +17,9 @@ For most other sources, the last 40 bits are::
 
     running number (22 bits) << 18 | member (18 bits)
 
-For strong lenses, they are 40 random bits (`hashed_id`).
+For strong lenses, they are 40 random bits (`hashed_id`). Transients have the kind of stars, whose member is 0 or 1; the
+highest bit of their member is 1, and the other 39 bits are random (`transient_id`). The lowest two bits of images of
+lensed transients and quasars are the number of the image.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from lake_schema.arrays import Int
+from lake_schema.arrays import Bool, Int
 from lake_schema.errors import BadInput
 
 # HEALPix order of the cells in which sources are generated.
@@ -36,6 +38,10 @@ FILE_ORDER = 5
 _NUMBER_BITS = 22
 # Number of bits for the member, the number of a galaxy in its halo.
 MEMBER_BITS = 18
+# Code of stars, and of transients.
+STAR_KIND = 5
+# Bit of an identifier that is 1 for transients and 0 for stars: the highest bit of the member.
+_TRANSIENT_BIT = np.int64(1 << MEMBER_BITS - 1)
 # Number of bits of an identifier after the kind and the order-8 cell, which are its higher bits.
 BLOCK_BITS = MEMBER_BITS + _NUMBER_BITS
 # Number of bits of an identifier for both the number of a drawn halo and the number of a galaxy (member) in this halo.
@@ -160,15 +166,15 @@ def satellite_id(halo: Int, member: Int, bits: npt.ArrayLike = MEMBER_BITS) -> I
     return np.asarray(np.int64(1) << 60 | halo | member)
 
 
-def hashed_id(kind: int, cell: int, words: npt.NDArray[np.uint64]) -> Int:
+def hashed_id(kind: int, cell: npt.ArrayLike, words: npt.NDArray[np.uint64]) -> Int:
     """Build the identifiers of rare sources that have no running number, from random bits.
 
     Parameters
     ----------
     kind : int
         Code of the type of all sources, 0 to 7; not checked.
-    cell : int
-        Nested HEALPix cell of order 8 that contains all sources.
+    cell : int or int array, shape (n,)
+        Nested HEALPix cell of order 8 that contains the source.
     words : uint64 array, shape (n,)
         Random 64-bit integers, one per source; their lowest 40 bits are used.
 
@@ -187,6 +193,35 @@ def hashed_id(kind: int, cell: int, words: npt.NDArray[np.uint64]) -> Int:
     return np.asarray(np.int64(kind) << 60 | _shifted_cell(cell) | hashed_bits.astype(np.int64))
 
 
+def transient_id(cell: npt.ArrayLike, words: npt.NDArray[np.uint64]) -> Int:
+    """Build the identifiers of transients, such as supernovae, from random bits.
+
+    Parameters
+    ----------
+    cell : int or int array, shape (n,)
+        Nested HEALPix cell of order 8 that contains the transient.
+    words : uint64 array, shape (n,)
+        Random 64-bit integers, one per transient; 39 of their lowest 40 bits are used.
+
+    Returns
+    -------
+    int64 array, shape (n,)
+        Identifiers. They may not be unique: with a thousand transients per cell, two are equal in one of a million
+        cells.
+
+    Raises
+    ------
+    BadInput
+        If the cell does not exist.
+    """
+    return hashed_id(STAR_KIND, cell, words) | _TRANSIENT_BIT
+
+
+def is_transient(ids: Int) -> Bool:
+    """Return True for the identifiers of transients."""
+    return np.asarray((kind_from_id(ids) == STAR_KIND) & (ids & _TRANSIENT_BIT > 0))
+
+
 def halo_from_id(ids: Int) -> Int:
     """Return the identifier of the halo of each galaxy whose halo has a running number in its cell (`source_id`).
 
@@ -199,6 +234,11 @@ def halo_from_id(ids: Int) -> Int:
 def kind_from_id(ids: Int) -> Int:
     """Return the code of the type of each source, 0 to 7: the highest bits of its identifier."""
     return ids >> 60
+
+
+def cell_from_id(ids: Int) -> Int:
+    """Return the nested HEALPix cell of order 8 in the identifier of each source: where it, or its halo, was drawn."""
+    return ids >> BLOCK_BITS & np.int64((1 << 2 * GENERATION_ORDER + 4) - 1)
 
 
 def _shifted_cell(cell: npt.ArrayLike) -> Int:

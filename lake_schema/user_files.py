@@ -29,6 +29,7 @@ MAX_BYTES = {
     "curve": 16 * _MB,
     "table of a curve": 4 * _MB,
     "library of spectra": 64 * _MB,
+    "spectral series": 128 * _MB,
     "PSF": 512 * _MB,
     "map of dust": 8 * _GB,
     "library of galaxies": 128 * _MB,

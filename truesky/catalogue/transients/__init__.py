@@ -1,0 +1,1 @@
+"""Draw supernovae in the galaxies of a lake."""
