@@ -89,6 +89,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
 
 def _draw_steps(lake: Path, request: Request) -> list[Step]:
     universe = request.facts("universe")["universe"]
+    # Galaxies do not depend on these.
     del universe["star_limit"]
     user_inputs = request.ingest
     check_band(request)
@@ -257,6 +258,8 @@ def _universe_section(facts: Json, names: Sequence[str]) -> Universe:
     if settings.get("lensing") is not None:
         settings["lensing"] = tuple(settings["lensing"])
     settings["cosmology"] = from_facts(facts)
+    if "high_redshift_boost" in names:
+        settings["variables"] = facts.get("variables", False)
     _refuse_other_camb(settings["cosmology"], facts.get("camb", ""))
     return Universe(**settings)
 

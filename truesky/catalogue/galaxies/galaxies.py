@@ -46,7 +46,12 @@ from truesky.catalogue.halos import luminosity_function, matching, population, q
 from truesky.catalogue.halos.halo_catalogue import LightCone
 from truesky.catalogue.halos.luminosity_function import Inverse, Schechter
 from truesky.catalogue.halos.population import CellCache, Members, Population
+from truesky.catalogue.nuclei import accretion, narrow_lines
+from truesky.catalogue.nuclei.accretion import Laws
+from truesky.catalogue.nuclei.narrow_lines import LineTables, NarrowLines
+from truesky.catalogue.nuclei.quasar_hosts import QuasarHosts
 from truesky.fluxes import passbands
+from truesky.fluxes.high_redshift import QUASAR
 from truesky.fluxes.libraries import templates
 from truesky.fluxes.passbands import Passband
 from truesky.randomness.per_source import PerSourceGenerator
@@ -57,6 +62,25 @@ from truesky.request.schema import Universe
 _CANDIDATE_MARGIN = 0.25
 # Emission lines are computed only for galaxies whose continuum is at most this much (mag) fainter than the limit.
 _LINE_MARGIN = 0.75
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NucleusModel:
+    """Model of active nuclei.
+
+    Attributes
+    ----------
+    laws : Laws
+        Distributions of accretion rates and types.
+    lines : NarrowLines
+        Ratios of narrow lines.
+    hosts : QuasarHosts or None
+        Expected number of quasars in halos; None for random positions of quasars.
+    """
+
+    laws: Laws
+    lines: NarrowLines
+    hosts: QuasarHosts | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +126,8 @@ class GalaxyModel:
         Quasars, and galaxies beyond redshift 6.
     training : Training or None
         The user's observed galaxies, whose spectra are used; None to choose spectra by colour.
+    nuclei : NucleusModel or None
+        Active nuclei; None without variable sources.
     """
 
     limit: float
@@ -123,6 +149,7 @@ class GalaxyModel:
     lines: LineModel
     distant: tuple[Kind, ...]
     training: Training | None
+    nuclei: NucleusModel | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,7 +243,16 @@ def model(
         lines=emission_lines.model(),
         distant=distant,
         training=training,
+        nuclei=_nuclei(halo_population, distant) if requested.variables else None,
     )
+
+
+def _nuclei(halo_population: Population, distant: tuple[Kind, ...]) -> NucleusModel:
+    quasars = [kind for kind in distant if kind.code == QUASAR]
+    # The user's halos may have another depth than hosts of quasars need.
+    in_halos = quasars and halo_population.light_cone is None
+    hosts = high_redshift.hosts(quasars[0], halo_population.halos) if in_halos else None
+    return NucleusModel(accretion.laws(), narrow_lines.laws(), hosts)
 
 
 def halos_and_galaxies(
@@ -347,7 +383,13 @@ def draw_members(
         **_shape_columns(universe, members, drawn, physical["log_stellar_mass"]),
     }
     rows = [GALAXIES.build(columns)]
-    rows += [high_redshift.draw(cell, seed, kind, lens, dust, position_filter) for kind in universe.distant]
+    hosts = universe.nuclei.hosts if universe.nuclei else None
+    for kind in universe.distant:
+        if kind.code == QUASAR and hosts is not None:
+            rows.append(high_redshift.draw_in_halos(cell, seed, kind, hosts, lens, dust, position_filter))
+            # Only the quasars beyond the halos, at z > 6, have random positions.
+            kind = replace(kind, z_end=0.0)
+        rows.append(high_redshift.draw(cell, seed, kind, lens, dust, position_filter))
     return sort_rows(lensing.rotate_position_angles(pa.concat_tables(rows), universe.rotation))
 
 
@@ -448,6 +490,12 @@ def _bright(
     log_sfr = stellar_mass.log_sfr(universe.star_formation, main, colour.sequence, colour.deviate, rng)
     rng = PerSourceGenerator(source_ids, seed, "galaxies.lines")
     fluxes = emission_lines.fluxes(universe.lines, cosmology, drawn.z, log_mass, log_sfr, colour.red, rng)
+    if universe.nuclei is not None:
+        nuclei = accretion.draw(universe.nuclei.laws, source_ids, seed, drawn.z, log_mass)
+        rng = PerSourceGenerator(source_ids, seed, "active_nuclei.lines")
+        tables = LineTables(universe.lines.hydrogen, universe.lines.dust)
+        added = narrow_lines.fluxes(universe.nuclei.lines, tables, cosmology, nuclei, drawn.z, log_mass, rng)
+        fluxes = {name: flux + added[name] for name, flux in fluxes.items()}
     light = emission_lines.mean_line_flux(universe.band, members.z_obs[drawn.row], fluxes)
     is_bright = emission_lines.magnitude_with_light(drawn.magnitude, light) < universe.limit
     columns = {"log_stellar_mass": log_mass, "log_sfr": log_sfr, **fluxes}

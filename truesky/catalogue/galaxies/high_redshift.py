@@ -1,8 +1,9 @@
 """Draw quasars (`kind` 2) and galaxies beyond redshift 6 (`kind` 3) as rows of table `galaxies`.
 
-Their positions are random, without clustering. The column `density_boost` is the ratio of the drawn to the natural
-number density. Each interval of one magnitude is drawn separately, so a catalogue with a brighter limit contains the
-same bright objects as a deeper one. The parameters are in high_redshift.toml.
+Their positions are random, without clustering; with `draw_in_halos`, quasars below redshift 6 are in halos. The column
+`density_boost` is the ratio of the drawn to the natural number density. Each interval of one magnitude is drawn
+separately, so a catalogue with a brighter limit contains the bright objects of a deeper catalogue. The file
+high_redshift.toml contains the parameters.
 
 References
 ----------
@@ -27,6 +28,10 @@ from truesky.catalogue import dust_map, parameters
 from truesky.catalogue.galaxies import halo_lensing, morphology
 from truesky.catalogue.galaxies.halo_lensing import Neighbourhood
 from truesky.catalogue.galaxies.lensing import Lens
+from truesky.catalogue.halos.halos import HaloModel
+from truesky.catalogue.halos.population import observed_redshift
+from truesky.catalogue.nuclei import quasar_hosts
+from truesky.catalogue.nuclei.quasar_hosts import QuasarHosts
 from truesky.cosmology import Cosmology
 from truesky.fluxes.high_redshift import (
     HIGH_REDSHIFT,
@@ -187,17 +192,86 @@ def draw(
     numbers = ids.FIRST_NUMBER + np.flatnonzero(selected)
     z, m, ra, dec = z[selected], m[selected], ra[selected], dec[selected]
     source = ids.source_id(np.full(numbers.size, kind.code), cell, numbers)
-    rng = PerSourceGenerator(source, seed, _STREAM[kind.code])
-    zeros = np.zeros(numbers.size)
     places = halo_lensing.columns(lens, ra, dec, kind.cosmology.comoving_distance(z))
+    identity = {"id": source, "halo_id": ids.halo_from_id(source), "z_obs": z}
+    return _rows(kind, seed, dust, m, {**identity, **places, "z_true": z})
+
+
+def hosts(kind: Kind, halo_model: HaloModel) -> QuasarHosts:
+    """Return the tables from which the quasars of `kind` below redshift 6 are drawn in halos.
+
+    Raises BadInput if a halo would have more than one quasar because of the boost.
+    """
+    z = halo_model.steps.z
+    included = (z > parameters.section(_FILE, "near_quasars")["z_min"]) & (z < _LIGHTCONE_END)
+    m = np.arange(_M_BRIGHTEST, quasar_hosts.faintest() + 0.5 * _M_STEP, _M_STEP)
+    counts = density(kind.code, kind.numbers, m[:-1] + 0.5 * _M_STEP, z[:, None]) * _M_STEP / HUBBLE**3
+    max_distance = float(kind.cosmology.comoving_distance(kind.z_end))
+    return quasar_hosts.model(halo_model, m, np.where(included[:, None], counts, 0.0), kind.boost, max_distance)
+
+
+def draw_in_halos(
+    cell: int,
+    seed: int,
+    kind: Kind,
+    tables: QuasarHosts,
+    lens: Lens | Neighbourhood,
+    dust: Float32,
+    position_filter: PositionFilter | None = None,
+) -> pa.Table:
+    """Draw the quasars below redshift 6 whose true positions are in a HEALPix cell of order 8, in halos.
+
+    Parameters
+    ----------
+    cell : int
+        Nested index of the order-8 cell.
+    seed : int
+        Seed of the request.
+    kind : Kind
+        Limits of the quasars.
+    tables : QuasarHosts
+        Expected number of quasars in halos, from `hosts`.
+    lens : Lens or Neighbourhood
+        Lensing maps, a uniform shear, or maps with the halos that lens sources in the cell.
+    dust : float32 array, shape (pixels,)
+        Map of the Milky Way's A(V), mag (truesky.catalogue.dust_map).
+    position_filter : callable, optional
+        Function that returns True for the true positions (ra, dec) to keep; None keeps all.
+
+    Returns
+    -------
+    Table
+        Rows of table `galaxies`, not sorted. A quasar has the position and the redshifts of the central galaxy of its
+        halo. Its identifier is that of the halo, with the kind of quasars.
+    """
+    quasars = quasar_hosts.draw(tables, seed, cell)
+    z = tables.halos.distances.redshift(quasars.halos.chi)
+    ra, dec = sky.positions_of_indices(quasars.halos.index)
+    selected = (ultraviolet_magnitude(kind.cosmology, quasars.m_1450, z) < kind.limit) & (z < kind.z_end)
+    if position_filter is not None:
+        selected &= position_filter(ra, dec)
+    host, z = quasars.halos.select(selected), z[selected]
+    identity = {
+        "id": np.int64(kind.code) << 60 | host.id,
+        "halo_id": host.id,
+        "z_obs": observed_redshift(z, host.velocity),
+        "log_halo_mass": host.log_mass,
+    }
+    places = halo_lensing.columns(lens, ra[selected], dec[selected], host.chi)
+    return _rows(kind, seed, dust, quasars.m_1450[selected], {**identity, **places, "z_true": z})
+
+
+def _rows(kind: Kind, seed: int, dust: Float32, m: Float, drawn: dict[str, Any]) -> pa.Table:
+    """Return rows of table `galaxies` for objects with absolute magnitudes `m`.
+
+    `drawn` are their identifiers, positions, lensing, redshifts and, for quasars in halos, halo masses, as columns.
+    """
+    z, zeros = np.asarray(drawn["z_true"], float), np.zeros(m.size)
+    rng = PerSourceGenerator(np.asarray(drawn["id"], np.int64), seed, _STREAM[kind.code])
     columns = {
-        "id": source,
-        "halo_id": ids.halo_from_id(source),
-        **places,
-        "kind": np.full(numbers.size, kind.code),
-        "density_boost": np.full(numbers.size, kind.boost),
-        "z_true": z,
-        "z_obs": z,
+        **drawn,
+        "kind": np.full(m.size, kind.code),
+        "density_boost": np.full(m.size, kind.boost),
         "abs_mag_r01": m - 5.0 * np.log10(HUBBLE),
         "mag_r01": ultraviolet_magnitude(kind.cosmology, m, z),
         "sed_1": _templates(kind, m, rng),
@@ -207,7 +281,7 @@ def draw(
         **{name: zeros.astype(int) for name in ("ext_law_1", "ext_law_2")},
         **{name: zeros for name in ("ebv_1", "ebv_2")},
         **_shapes(kind, z, m, rng),
-        "a_v": dust_map.a_v(dust, places["ra"], places["dec"]),
+        "a_v": dust_map.a_v(dust, drawn["ra"], drawn["dec"]),
     }
     return GALAXIES.build(columns)
 

@@ -25,7 +25,7 @@ import pyarrow as pa
 import scipy
 
 from lake_schema import ids, sky
-from lake_schema.arrays import Array, Float, Float32, Int
+from lake_schema.arrays import Array, Bool, Float, Float32, Int
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 from lake_schema.units import LIGHT_KM_S
@@ -191,9 +191,8 @@ def draw(cell: int, galaxies: pa.Table, seed: int, boost: float, cosmology: Cosm
     law, stamp_settings = laws(), stamps()
     columns = {name: galaxies[name].to_numpy() for name in COLUMNS}
     rows = []
-    area = sky.cell_area(GENERATION_ORDER) * 3600.0**2
-    for pair in _pairs(law, cosmology, columns, boost, area, seed):
-        system = _system(law, columns, pair)
+    for pair in draw_pairs(law, cosmology, columns, columns["kind"] < 2, boost, seed):
+        system = system_of_pair(law, columns, pair)
         side = _side(stamp_settings, *system)
         # An image with one ray per pixel takes little time, and excludes most lenses whose magnification is too small.
         if (
@@ -368,13 +367,33 @@ def shoot_rays(lens: Lens, source: Disc, stamp_settings: Stamps, side: int) -> F
     return picture
 
 
-def _pairs(
-    law: Laws, cosmology: Cosmology, columns: dict[str, Array], boost: float, area: float, seed: int
+def draw_pairs(
+    law: Laws, cosmology: Cosmology, columns: dict[str, Array], is_source: Bool, boost: float, seed: int
 ) -> list[Pair]:
-    """Draw pairs of a lens and a source from the galaxies of a cell with an area in arcsec2.
+    """Draw pairs of a lens and a source from the rows of table `galaxies` in a generation cell.
 
-    Each pair is drawn independently of all other pairs. A deeper catalogue therefore contains the same pairs and more.
+    Parameters
+    ----------
+    law : Laws
+        Selection and properties of lenses.
+    cosmology : Cosmology
+        Parameters of the universe.
+    columns : dict of str to array, shape (n,)
+        Columns COLUMNS of the rows.
+    is_source : bool array, shape (n,)
+        True for the rows that may be sources.
+    boost : float
+        Ratio of the drawn to the natural number density of strong lenses.
+    seed : int
+        Seed of the request.
+
+    Returns
+    -------
+    list of Pair
+        The pairs. Each pair is drawn independently of all other pairs. A deeper catalogue therefore contains the same
+        pairs and more.
     """
+    area = sky.cell_area(GENERATION_ORDER) * 3600.0**2
     is_galaxy = columns["kind"] < 2
     lens = np.flatnonzero(is_galaxy & (columns["color_gr_01"] > law.reddest_blue) & (columns["z_true"] > 0.02))
     z_lens, rng = columns["z_true"][lens].astype(float), PerSourceGenerator(columns["id"][lens], seed, "strong_lenses")
@@ -388,7 +407,7 @@ def _pairs(
     window = np.where(chance < _WINDOW, _WINDOW, 1.0)
     lenses = per_source.keys(columns["id"][lens], seed, "strong_lenses", "pair"), rng.random(), window, chance, z_lens
 
-    source = np.flatnonzero(is_galaxy)
+    source = np.flatnonzero(is_source)
     place = PerSourceGenerator(columns["id"][source], seed, "strong_lenses", "source").random()
     source, place = source[np.argsort(place)], np.sort(place)
     source_keys = per_source.keys(columns["id"][source], seed, "strong_lenses", "source")
@@ -415,11 +434,23 @@ def _allocate(count: int) -> tuple[Int, Int, npt.NDArray[np.uint64], Float]:
     return np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.uint64), np.empty((count, 4))
 
 
-def _system(law: Laws, columns: dict[str, Array], pair: Pair) -> tuple[Lens, Disc]:
+def system_of_pair(law: Laws, columns: dict[str, Array], pair: Pair) -> tuple[Lens, Disc]:
     """Return the lens and the source of a pair.
 
-    The mass of the lens has the position angle of its light. The source is at a random place in the circle with the
-    Einstein radius around the lens.
+    Parameters
+    ----------
+    law : Laws
+        Properties of lenses.
+    columns : dict of str to array, shape (n,)
+        Columns COLUMNS of the rows of table `galaxies` from which the pair was drawn.
+    pair : Pair
+        The pair.
+
+    Returns
+    -------
+    Lens, Disc
+        The mass of the lens has the position angle of its light. The source is at a random place in the circle with the
+        Einstein radius around the lens.
     """
     _, shape_deviate, area_fraction, angle_fraction = pair.numbers.tolist()
     q = float(np.clip(law.axis_ratio + law.axis_ratio_scatter * shape_deviate, *law.axis_ratio_limits))

@@ -1,0 +1,1 @@
+"""Draw the active nuclei of galaxies, and the halos of quasars."""
