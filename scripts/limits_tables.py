@@ -105,7 +105,7 @@ def _request() -> list[str]:
 
 def _lake() -> list[str]:
     def rows() -> Iterator[Sequence[str]]:
-        for table in tables.all_tables(["<band>"]):
+        for table in tables.all_tables(["<band>"], variables=True):
             for column in table.columns:
                 if column.type not in ("string", "bool") and not column.codes:
                     limits = (_format_number(column.lo), _format_number(column.hi))

@@ -46,7 +46,7 @@ SAMPLES: tuple[dict[str, Any], ...] = (
         "universe": {
             "galaxy_limit": 24.0, "star_limit": 24.0, "z_max": 5.0, "box_cells": 192, "lensing_nside": 64,
             "high_redshift_boost": 1.0, "quasar_boost": 1.0, "lensing": {"g1": 0.0, "g2": 0.0}, "alignment": 1.0,
-            "rotation": 0.0,
+            "rotation": 0.0, "transients": {"start": 61000.0, "end": 61100.0, "boost": 1.0}, "variables": True,
             "cosmology": {
                 "omega_m": 0.3, "omega_b": 0.05, "h": 0.7, "sigma_8": 0.8, "n_s": 0.96, "w0": -0.9, "wa": 0.1,
                 "m_nu": 0.0,

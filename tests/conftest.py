@@ -41,7 +41,8 @@ _GROUPS = {
         "tests/truesky/catalogue/galaxies/test_emission_lines.py", "tests/truesky/catalogue/galaxies/test_galaxies.py",
         "tests/truesky/catalogue/galaxies/test_high_redshift.py", "tests/truesky/catalogue/galaxies/test_lensing.py",
         "tests/truesky/catalogue/galaxies/test_strong_lenses.py", "tests/truesky/catalogue/halos/test_halos.py",
-        "tests/truesky/validation/model/test_observed.py", "tests/truesky/validation/model/test_universe.py",
+        "tests/truesky/catalogue/test_lensed_quasars.py", "tests/truesky/validation/model/test_observed.py",
+        "tests/truesky/validation/model/test_universe.py",
     ),
 }  # fmt: skip
 _SCOPES = {file: group for group, files in _GROUPS.items() for file in files}

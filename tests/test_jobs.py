@@ -10,11 +10,20 @@ import pytest
 
 from lake_schema.store import layout, read
 from tests import requests
-from truesky.catalogue import build_gaia, build_galaxies, build_stars, build_strong_lenses
+from truesky.catalogue import (
+    build_active_nuclei,
+    build_gaia,
+    build_galaxies,
+    build_lensed_images,
+    build_stars,
+    build_strong_lenses,
+    build_transients,
+)
 from truesky.commands import demo
 from truesky.commands import run as whole
 from truesky.emulator import build_observed, build_randoms
 from truesky.fluxes import compute_fluxes
+from truesky.light_curve_tables import build_light_curves
 from truesky.render import plan_exposures, render_exposures
 from truesky.request.from_toml import from_table
 from truesky.running import submitted_job
@@ -23,8 +32,9 @@ from truesky.survey_maps import build_depth
 ROOT = Path(__file__).parents[1]
 FIRST = (build_galaxies.JOB, build_stars.JOB)
 LATER = (
-    compute_fluxes.JOB, build_strong_lenses.JOB, build_gaia.JOB, plan_exposures.JOB, build_depth.JOB,
-    render_exposures.JOB, build_randoms.JOB, build_observed.JOB,
+    compute_fluxes.JOB, build_active_nuclei.JOB, build_transients.JOB, build_strong_lenses.JOB, build_lensed_images.JOB,
+    build_gaia.JOB, plan_exposures.JOB,
+    build_depth.JOB, build_light_curves.JOB, render_exposures.JOB, build_randoms.JOB, build_observed.JOB,
 )  # fmt: skip
 JOBS = FIRST + LATER
 # Four order-5 cells meet here, so that there is something to share out.
@@ -113,8 +123,12 @@ def test_missing_input_tables_are_named(job, tmp_path, capsys):
     assert submitted_job.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 2
     missing = {
         "compute_fluxes": "has no tables: run truesky run REQUEST",
+        "build_active_nuclei": "universe.variables is false",
         "build_strong_lenses": "has no tables: run truesky run REQUEST",
+        "build_lensed_images": "has no tables: run truesky run REQUEST",
+        "build_transients": "has no transients: set universe.transients",
         "build_depth": "has no tables: run truesky run REQUEST",
+        "build_light_curves": "it has no exposures for light curves",
         "build_gaia": "has no tables: run truesky run REQUEST",
         "plan_exposures": "it must have a pointing or an observation",
         "render_exposures": "has no tables: run truesky run REQUEST",
@@ -137,6 +151,7 @@ sys.path[0] = {str(ROOT)!r}
 from truesky.running import submitted_job
 from truesky.catalogue import build_galaxies, build_stars
 from truesky.fluxes import compute_fluxes
+from truesky.light_curve_tables import build_light_curves
 sys.exit(max(submitted_job.main(m.JOB, sys.argv[1:]) for m in (build_galaxies, build_stars, compute_fluxes)))
 """)
     manifests = []

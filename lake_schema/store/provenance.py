@@ -20,7 +20,7 @@ _PACKAGES = ("lake_schema", "truesky")
 # Folders of examples, which are left out of the fingerprint of the code. An installed package contains them, but in a
 # clone of the repository they are elsewhere.
 _EXCLUDED_FOLDERS = {"requests", "notebooks"}
-_SUFFIXES = {".py", ".csv", ".toml"}
+_SUFFIXES = {".py", ".csv", ".npz", ".toml"}
 # Libraries whose version can change the bytes of tables and images.
 _LIBRARIES = (
     "astropy",

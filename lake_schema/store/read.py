@@ -436,7 +436,13 @@ class Version:
             listed = "" if all(questions) else f"; it has {', '.join(existing)}"
             raise BadInput(f"table {self.table} has no column {spelling.join_words(named, 'and')}{listed}")
 
-    def rows_in_cells(self, cells: Sequence[int], order: int, columns: Sequence[str] | None = None) -> pa.Table:
+    def rows_in_cells(
+        self,
+        cells: Sequence[int],
+        order: int,
+        columns: Sequence[str] | None = None,
+        where: ds.Expression | None = None,
+    ) -> pa.Table:
         """Return the rows of a catalogue in some HEALPix cells; only files and row groups that may match are read.
 
         Parameters
@@ -447,6 +453,8 @@ class Version:
             HEALPix order of the cells.
         columns : sequence of str, optional
             Names of columns; by default all.
+        where : pyarrow.dataset.Expression, optional
+            Condition that the rows must satisfy; by default all rows are returned.
 
         Returns
         -------
@@ -462,7 +470,8 @@ class Version:
         for partition in self.partitions:
             cells_in_partition = _cells_in_partition(partition, unique_cells, order)
             if cells_in_partition.size:
-                pieces.append(self.rows(names, [partition], _range_filter(_ranges(cells_in_partition, order))))
+                in_cells = _range_filter(_ranges(cells_in_partition, order))
+                pieces.append(self.rows(names, [partition], in_cells if where is None else in_cells & where))
         rows = pa.concat_tables(pieces)
         inside = np.isin(sky.parent(rows["_healpix_29"].to_numpy(), sky.MAX_ORDER, order), unique_cells)
         rows = rows.filter(pa.array(inside))

@@ -228,6 +228,11 @@ class ExposureRow:
     sky_slope_x: float | None = None
     sky_slope_y: float | None = None
 
+    @property
+    def middle_mjd(self) -> float:
+        """MJD of the middle of the exposure."""
+        return self.mjd + 0.5 * self.exposure_time_s / 86400.0
+
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> ExposureRow:
         """Make an instance from a row of an Arrow table, a mapping of column names to values.

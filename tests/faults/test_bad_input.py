@@ -20,6 +20,7 @@ from tests.universe import plain_plan, plain_work
 from truesky.catalogue import (
     build_gaia,
     build_galaxies,
+    build_lensed_images,
     build_stars,
     build_strong_lenses,
     dust_map,
@@ -43,7 +44,8 @@ MOST_SECONDS = 30.0
 JOBS = {
     module.JOB.name: module.JOB
     for module in (
-        build_galaxies, build_stars, build_strong_lenses, build_gaia, compute_fluxes, plan_exposures, render_exposures,
+        build_galaxies, build_stars, build_strong_lenses, build_lensed_images, build_gaia, compute_fluxes,
+        plan_exposures, render_exposures,
     )
 }  # fmt: skip
 

@@ -16,7 +16,7 @@ from lake_schema.store import manifest, parquet
 from lake_schema.tables import all_tables
 from tests.universe import TOY, rows_of
 
-TABLES = all_tables(["euclid_vis", "lsst_r"])
+TABLES = all_tables(["euclid_vis", "lsst_r"], variables=True)
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda t: t.name)

@@ -1,5 +1,6 @@
 """The reference page, declarations by name, and the tables that record inputs: mission, templates, passbands."""
 
+import hashlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import get_type_hints
@@ -16,12 +17,14 @@ from lake_schema.mission.parameter import read_all_parameters
 from lake_schema.store import publish, read
 from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.store.validate import check_rows
-from lake_schema.tables import mission, passbands, templates
+from lake_schema.tables import mission, passbands, stars, templates
 from lake_schema.tables.common import Origin
 from lake_schema.tables.exposures import EXPOSURES, ExposureRow
 from truesky.commands import __main__
 from truesky.fluxes import passbands as responses
 
+# sha256 of the fields of table `stars` without variable stars; lakes of earlier versions contain it.
+STARS_SCHEMA = "d883afb4bebdb48c5659d7e130fb18b412134f2552f7d67b31fc6b9903e7c19e"
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tables.md"
 
 
@@ -31,10 +34,22 @@ def test_the_reference_page_is_up_to_date(capsys):
     assert PAGE.read_text() == capsys.readouterr().out
 
 
-def test_tables_are_found_by_name():
-    for table in tables.all_tables(["euclid_vis", "lsst_r"]):
+@pytest.mark.parametrize("variables", [False, True])
+def test_tables_are_found_by_name(variables):
+    for table in tables.all_tables(["euclid_vis", "lsst_r"], variables):
         assert tables.find_table(table.name, table.names) == table
     assert tables.find_table("nothing") is None
+
+
+def test_variable_stars_add_nullable_columns_to_the_table_of_stars():
+    """Without them, the table is the same as if the columns had never been declared."""
+    plain, variable = stars.stars(False), stars.stars(True)
+    assert plain == stars.STARS
+    assert variable.columns[: len(plain.columns)] == plain.columns
+    assert not {column.name for column in stars.VARIABILITY_COLUMNS} & set(plain.names)
+    assert all(column.nullable for column in stars.VARIABILITY_COLUMNS)
+    fields = [(f.name, str(f.type), f.nullable, sorted(f.metadata.items())) for f in plain.arrow_schema()]
+    assert hashlib.sha256(repr(fields).encode()).hexdigest() == STARS_SCHEMA
 
 
 def test_a_row_of_exposures_has_a_field_per_column():

@@ -13,7 +13,7 @@ from lake_schema import tables, votable
 from lake_schema.store import parquet
 from tests.universe import PLAIN, rows_of
 
-DECLARED = tables.all_tables(["euclid_vis", "lsst_r"])
+DECLARED = tables.all_tables(["euclid_vis", "lsst_r"], variables=True)
 
 
 def opened(path):

@@ -345,6 +345,42 @@ class Lake(LakeTables):
         except BadInput as error:
             raise BadInput(f"{error}; Lake.images() lists the paths of the images") from None
 
+    @arguments.refuse_missing("lake.light_curve(id, band, mjd)")
+    def light_curve(self, id: int | Sequence[int], band: str, mjd: float | Sequence[float]) -> pd.DataFrame:
+        """Compute the fluxes of sources at any dates: supernovae, stars, galaxies, quasars and lensed images.
+
+        Parameters
+        ----------
+        id : int or sequence of int
+            Identifiers of sources in the tables ``transients``, ``stars``, ``galaxies`` and ``lensed_images``, or
+            ``point_id`` of the table ``active_nuclei`` for a nucleus without its galaxy. A source that does not vary
+            has the same flux at all dates.
+        band : str
+            Name of a passband; for stars and galaxies, one in which the lake has fluxes.
+        mjd : float or sequence of float
+            Dates, MJD.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row per source and date, with the columns id, band, mjd, f_nu (microjansky) and mag (AB; infinite
+            without light). Magnification and the Milky Way's dust are included.
+
+        Raises
+        ------
+        BadInput
+            If there is no such source, the passband is unknown, or a date is not a number.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> lake = truesky.open("out/demo/lake")  # doctest: +SKIP
+        >>> lake.light_curve(id, "lsst_r", np.arange(60900.0, 61000.0))  # doctest: +SKIP
+        """
+        from truesky.api import light_curves
+
+        return light_curves.light_curves(self._explorer.root, self._explorer.versions, id, band, mjd)
+
     @cached_property
     def _painter(self) -> SkyPainter:
         from truesky.api import sky_images

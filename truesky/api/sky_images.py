@@ -60,7 +60,7 @@ _PSF_ELECTRONS = 1e9
 _PSFS = 4
 # Tables that are used if the lake has them, besides the catalogues and their fluxes.
 _CATALOGUES = ("galaxies", "galaxy_fluxes", "stars", "star_fluxes")
-_OPTIONAL = ("strong_lenses",)
+_OPTIONAL = ("strong_lenses", "transients", "lensed_images", "active_nuclei")
 _PLANNED = ("exposures", "tasks", "mission")
 
 
@@ -490,6 +490,9 @@ def find_tables(versions: Mapping[str, read.Version], root: Folder) -> PainterTa
     for name in _CATALOGUES:
         if name not in versions:
             raise BadInput(f"lake {root}: has no table {name}, which images need")
+    for name in _OPTIONAL[1:]:
+        if name in versions and versions[name].manifest["facts"].get("galaxies") != versions["galaxies"].key:
+            raise BadInput(f"lake {root}: {name} was made from another version of galaxies: run build_{name} first")
     names = [name for name in (*_CATALOGUES, *_OPTIONAL, *_PLANNED, "products") if name in versions]
     return PainterTables(root, tuple((name, versions[name].key) for name in names))
 

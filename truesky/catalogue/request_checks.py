@@ -22,6 +22,10 @@ from truesky.fluxes.libraries import templates
 from truesky.request.files import SOURCES_KIND, Catalogue
 from truesky.request.schema import Request, Stars
 from truesky.request.toml_values import refuse_name
+from truesky.variability import spectral_series
+
+# Largest boost of quasars with which halos have one quasar at most, rounded down.
+_MAX_QUASAR_BOOST = 6.0
 
 
 def check_request(request: Request) -> None:
@@ -43,6 +47,8 @@ def check_request(request: Request) -> None:
             _check_halos,
             _check_training,
             _check_stars,
+            _check_variables,
+            check_transients,
         ):
             mistakes.read(check, request)
 
@@ -65,6 +71,27 @@ def check_cosmology(cosmology: Cosmology) -> None:
         problem = f"the distance to z = {matching.Z_LAST:g} is {distance:.0f} Mpc/h, at most {largest:.0f} is possible"
         raise BadInput(f"universe.cosmology: {problem}: increase omega_m, w0 or wa")
     boltzmann.camb_version(cosmology)
+
+
+def _check_variables(request: Request) -> None:
+    """Raise BadInput if quasars would be too many for the halos in which variable ones are."""
+    boost = request.universe.quasar_boost
+    if request.universe.variables and request.ingest.galaxies is None and boost > _MAX_QUASAR_BOOST:
+        limit = f"must be at most {_MAX_QUASAR_BOOST:g} with universe.variables"
+        raise BadInput(f"universe.quasar_boost = {boost:g} {limit}, so that no halo has two quasars")
+
+
+def check_transients(request: Request) -> None:
+    """Raise BadInput if a request has transients and no galaxies in which they explode, or a wrong file of spectra."""
+    if request.transients is None:
+        return
+    if request.sources is not None:
+        raise BadInput(
+            "universe.transients: galaxies from the tables of [sources] have no stellar masses, so none explodes"
+        )
+    if (path := request.transients.light_curves) is not None:
+        user_files.check_file(path, "spectral series", "universe.transients.light_curves")
+        spectral_series.read(path)
 
 
 def _check_dust(request: Request) -> None:

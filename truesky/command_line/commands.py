@@ -92,8 +92,21 @@ COMMANDS = {
         "simulate", "REQUEST LAKE", "make the table of strong lenses only", "requests/demo.toml my_lake",
         simulation.add_job_arguments, ("truesky.catalogue.build_strong_lenses",), True,
     ),
+    "nuclei": Command(
+        "simulate", "REQUEST LAKE", "make the table of active nuclei only", "requests/demo.toml my_lake",
+        simulation.add_job_arguments, ("truesky.catalogue.build_active_nuclei",), True,
+    ),
+    "transients": Command(
+        "simulate", "REQUEST LAKE", "make the table of supernovae only", "requests/demo.toml my_lake",
+        simulation.add_job_arguments, ("truesky.catalogue.build_transients",), True,
+    ),
+    "lensed": Command(
+        "simulate", "REQUEST LAKE", "make the table of lensed sources only",
+        "requests/demo.toml my_lake",
+        simulation.add_job_arguments, ("truesky.catalogue.build_lensed_images",), True,
+    ),
     "gaia": Command(
-        "simulate", "REQUEST LAKE", "make the table of stars as Gaia would list them only",
+        "simulate", "REQUEST LAKE", "make the table of stars as Gaia lists them only",
         "requests/demo.toml my_lake", simulation.add_job_arguments, ("truesky.catalogue.build_gaia",), True,
     ),
     "plan": Command(
@@ -103,6 +116,11 @@ COMMANDS = {
     "depth": Command(
         "simulate", "REQUEST LAKE", "make maps of depth and masks only",
         "requests/demo.toml my_lake", simulation.add_job_arguments, ("truesky.survey_maps.build_depth",), True,
+    ),
+    "light-curves": Command(
+        "simulate", "REQUEST LAKE", "make the light curves in the planned exposures only",
+        "requests/demo.toml my_lake", simulation.add_job_arguments,
+        ("truesky.light_curve_tables.build_light_curves",), True,
     ),
     "render": Command(
         "simulate", "REQUEST LAKE", "render the planned images only", "requests/demo.toml my_lake --limit 1",

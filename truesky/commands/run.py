@@ -70,7 +70,10 @@ CATALOGUES = (
     Stage("truesky.catalogue.build_stars", ("stars",)),
     Stage("truesky.fluxes.compute_fluxes", ("galaxy_fluxes", "star_fluxes")),
 )
+_TRANSIENTS = Stage("truesky.catalogue.build_transients", ("transients",))
 _LENSES = Stage("truesky.catalogue.build_strong_lenses", ("strong_lenses",))
+_LENSED_IMAGES = Stage("truesky.catalogue.build_lensed_images", ("lensed_images",))
+_NUCLEI = Stage("truesky.catalogue.build_active_nuclei", ("active_nuclei",))
 _GAIA = Stage("truesky.catalogue.build_gaia", ("gaia",))
 IMAGES = (
     Stage("truesky.render.plan_exposures", ("exposures", "tasks")),
@@ -99,7 +102,10 @@ def stages(request: Request, lenses: bool = False, with_gaia: bool = False) -> l
     *job_stages, fluxes = CATALOGUES
     if with_gaia:
         fluxes = replace(fluxes, changes=(("bands", tuple(dict.fromkeys((*request.bands, *gaia.BANDS)))),))
-    job_stages += [_LENSES] * lenses + [fluxes] + [_GAIA] * with_gaia
+    has_variables = request.universe.variables and request.sources is None
+    job_stages += [_NUCLEI] * has_variables + [_TRANSIENTS] * (request.transients is not None)
+    job_stages += [_LENSES] * lenses + [_LENSED_IMAGES] * (lenses and (request.transients is not None or has_variables))
+    job_stages += [fluxes] + [_GAIA] * with_gaia
     if not request.pointings and not request.observations:
         return job_stages
     plan, render = IMAGES

@@ -196,10 +196,10 @@ class Session:
         """Return the names of the columns of a table of the lake, [] for others and if the table cannot be opened."""
         table = name.rpartition(".")[2]
         declaration = declarations.find_table(table)
-        if declaration is None or not table.endswith("_fluxes"):
+        if declaration is None or not (table.endswith("_fluxes") or table == "stars"):
             return [] if declaration is None else list(declaration.names)
         try:
-            # The declaration does not contain the passbands of the lake.
+            # The declaration does not contain the passbands of the lake, and the columns of variable stars.
             return list(_open_table(self.root, name, self.table_keys[name]).schema.names)
         except LakeError:
             return []

@@ -303,7 +303,7 @@ def _targets(name: str, tables: Mapping[str, Collection[str]]) -> Sequence[Synon
 
 
 def _same_name(name: str, table: str, columns: Collection[str]) -> Iterator[Synonym]:
-    declaration = declarations.find_table(table)
+    declaration = declarations.find_table(table, list(columns))
     if name in columns and declaration is not None and name in declaration.names:
         yield Synonym(table, name, declaration.column(name).doc)
 

@@ -15,7 +15,7 @@ from truesky.numerics.cache import content_key
 from truesky.numerics.code_text import code_text
 
 _ROOT = Path(__file__).resolve().parents[2]
-_ENDINGS = (".csv", ".toml")
+_ENDINGS = (".csv", ".npz", ".toml")
 # Packages and modules that check, store, transport or name arrays but do not compute them. Their code is not part of a
 # hash.
 _IRRELEVANT = (
@@ -92,7 +92,7 @@ def _content(file: Path) -> bytes:
 
 @lru_cache
 def _data() -> dict[str, Path]:
-    """Return the path of every table (.csv, .toml) in the package `truesky` by its file name."""
+    """Return the path of every table (.csv, .npz, .toml) in the package `truesky` by its file name."""
     return {file.name: file for file in (_ROOT / "truesky").rglob("*") if file.suffix in _ENDINGS}
 
 

@@ -23,10 +23,12 @@ from truesky.render.exposure.records import PreviousExposure, PreviousSky, Rows,
 from truesky.render.planning import exposure_chunks, variants
 from truesky.render.previous_exposures import ChargeMaps, find_previous_exposures, moving_bodies
 from truesky.render.psf import from_file
-from truesky.render.sources import catalogue_rows, galaxy_stamps
+from truesky.render.sources import catalogue_rows, galaxy_stamps, varying_stars
 from truesky.render.sources.catalogue_rows import LENSES
 from truesky.render.sources.disc_structure import DiscStructure
+from truesky.render.sources.nuclei import read_nuclei
 from truesky.render.sources.solar_system import Population
+from truesky.render.sources.transients import read_transients
 from truesky.request.accuracy import Accuracy
 from truesky.request.structure import Arms, Stamps
 
@@ -133,6 +135,10 @@ def _with_structure(rows: Rows, request: Json, files: Mapping[str, str]) -> Rows
     return rows
 
 
+def _star_columns(inputs: Mapping[str, read.Version]) -> tuple[str, ...]:
+    return varying_stars.add_columns(visible_sources.STAR_COLUMNS, inputs["stars"].schema.names)
+
+
 def _read_rows(
     lake: Folder,
     inputs: Mapping[str, read.Version],
@@ -157,7 +163,7 @@ def _read_rows(
     catalogues = []
     for rows, fluxes, columns, limit in (
         ("galaxies", "galaxy_fluxes", visible_sources.GALAXY_COLUMNS, limits.far_galaxy),
-        ("stars", "star_fluxes", visible_sources.STAR_COLUMNS, limits.spikes),
+        ("stars", "star_fluxes", _star_columns(inputs), limits.spikes),
     ):
         bands = visible_spectra.flux_bands(exposed, inputs[fluxes].schema.names)
         versions = inputs[rows], inputs[fluxes]
@@ -180,5 +186,7 @@ def _read_rows(
         lenses=lenses,
         bodies=bodies,
         previous_exposures=previous_exposures,
+        transients=read_transients(inputs, task, extra_reach, limits.min_flux),
+        nuclei=read_nuclei(inputs, task, extra_reach, limits.min_flux),
         neighbours=board_neighbours.bright_stars(inputs, aim, variant),
     )

@@ -29,9 +29,11 @@ from truesky.render.channels.aim import Aim
 from truesky.render.exposure import persistence, visible_sources, visible_spectra
 from truesky.render.exposure.records import PreviousExposure, PreviousSky, Rows
 from truesky.render.planning import exposure_chunks, variants
-from truesky.render.sources import catalogue_rows, ephemerides, solar_system
+from truesky.render.sources import catalogue_rows, ephemerides, solar_system, varying_stars
 from truesky.render.sources.catalogue_rows import LENSES
+from truesky.render.sources.nuclei import read_nuclei
 from truesky.render.sources.solar_system import Population
+from truesky.render.sources.transients import read_transients
 from truesky.request.accuracy import Accuracy
 
 # Environment variable with the memory in MB that a process may use to keep charge maps.
@@ -236,6 +238,7 @@ class _Charges:
         # assumed to have flat f_nu.
         is_dispersed = aim.channel.dispersion is not None
         shapes = visible_sources.GALAXY_COLUMNS if is_dispersed else visible_sources.SHAPE_COLUMNS
+        star_columns = varying_stars.add_columns(visible_sources.STAR_COLUMNS, inputs["stars"].schema.names)
         versions = inputs["galaxies"], inputs["galaxy_fluxes"]
         galaxies, stars = (
             catalogue_rows.read_bright(
@@ -243,9 +246,7 @@ class _Charges:
                 inputs[fluxes],
                 [catalogue_rows.BrightQuery(task, columns, exposure.band, min_flux, extra_reach)],
             )[0]
-            for (rows, fluxes), columns in zip(
-                catalogue_rows.CATALOGUES, (shapes, visible_sources.STAR_COLUMNS), strict=True
-            )
+            for (rows, fluxes), columns in zip(catalogue_rows.CATALOGUES, (shapes, star_columns), strict=True)
         )
         lenses = None
         if LENSES in inputs:
@@ -256,6 +257,8 @@ class _Charges:
             *galaxies,
             *stars,
             lenses=lenses,
+            transients=read_transients(inputs, task, extra_reach, min_flux),
+            nuclei=read_nuclei(inputs, task, extra_reach, min_flux),
             bodies=moving_bodies(exposure, self.facts),
             galaxy_library=galaxy_library_from_facts(self.lake, inputs["galaxy_fluxes"].manifest["facts"]),
             stellar_library=stellar_library_from_facts(self.lake, inputs["star_fluxes"].manifest["facts"]),

@@ -34,6 +34,8 @@ from truesky.render.products.keys import (
 )
 from truesky.render.psf import from_file
 from truesky.render.sources.catalogue_rows import LENSES
+from truesky.render.sources.nuclei import ACTIVE_NUCLEI
+from truesky.render.sources.transients import LENSED_IMAGES, TRANSIENTS
 from truesky.request import structure
 from truesky.request.schema import IMAGE_OPTIONS, Request
 from truesky.running.task_chains import Link, LinkFunction
@@ -93,7 +95,7 @@ class RenderInputs:
         BadInput
             If a table is missing or was made for another request, or if truesky can render none of the exposures.
         """
-        mission, versions = mission_of(request.mission), _versions(lake, request)
+        mission, versions = mission_of(request.mission), input_versions(lake, request)
         preconditions.refuse_other_plan(versions, request, mission)
         published = reuse.reusable_tasks(lake, PRODUCTS.name, request.name)
         selection = exposure_chunks.select_for_rendering(
@@ -127,7 +129,7 @@ class RenderInputs:
         LakeError
             If a table is missing.
         """
-        mission, versions = mission_of(request.mission), _versions(lake, request)
+        mission, versions = mission_of(request.mission), input_versions(lake, request)
         published = reuse.reusable_tasks(lake, PRODUCTS.name, request.name)
         exposures_and_tasks = exposure_chunks.with_previous_exposures(
             versions, selection.exposures, selection.tasks, variants.mission_lookup(mission)
@@ -200,29 +202,39 @@ def _time_order(exposure: ExposureRow) -> tuple[float, int]:
     return exposure.mjd, exposure.exposure_id
 
 
-def _versions(lake: Path, request: Request) -> dict[str, read.Version]:
+def input_versions(lake: Path, request: Request) -> dict[str, read.Version]:
     """Return the stored versions of the tables that a request's images are made from, by table name.
 
-    The table `strong_lenses` is included if `_lenses` finds one for the request.
+    The tables `strong_lenses` and `lensed_images` are included if the lake has them for the request, and `transients`
+    and `active_nuclei` if the request has transients or variable sources.
     """
-    inputs = {name: read.input_version(lake, name, request.name) for name in INPUTS}
-    lenses = _lenses(lake, request, inputs["galaxies"])
-    return inputs if lenses is None else {**inputs, LENSES: lenses}
+    has_variables = request.universe.variables and request.sources is None
+    names = [*INPUTS, *[TRANSIENTS] * (request.transients is not None), *[ACTIVE_NUCLEI] * has_variables]
+    inputs = {name: read.input_version(lake, name, request.name) for name in names}
+    for name in (LENSES, LENSED_IMAGES):
+        version = _optional(lake, name, request, inputs)
+        inputs |= {} if version is None else {name: version}
+    return inputs
 
 
-def _lenses(lake: Path, request: Request, galaxies: read.Version) -> read.Version | None:
-    """Return the table `strong_lenses` for a request, or None if the lake has none.
+def _optional(lake: Path, table: str, request: Request, inputs: Mapping[str, read.Version]) -> read.Version | None:
+    """Return a table of a request that the lake may lack, or None if it has none.
 
-    If only another request has lenses, they are used only if they were placed in the same version of `galaxies`.
+    If only another request has the table, it is used only if it was made from the same versions of its inputs.
     """
-    if layout.current_key(lake, LENSES) is None:
+    if layout.current_key(lake, table) is None:
         return None
     version, request_key = (
-        read.input_version(lake, LENSES, request.name),
-        request_links.linked_key(lake, request.name, LENSES),
+        read.input_version(lake, table, request.name),
+        request_links.linked_key(lake, request.name, table),
     )
-    shared = request_key is None and version.key in request_links.keys_by_request(lake, LENSES).values()
-    return None if shared and version.manifest["facts"].get("galaxies") != galaxies.key else version
+    shared = request_key is None and version.key in request_links.keys_by_request(lake, table).values()
+    # Supernovae of another window, for example, have other images.
+    sources = ("galaxies",) if table == LENSES else ("galaxies", LENSES, TRANSIENTS)
+    is_same = all(
+        version.manifest["facts"].get(name) == (inputs[name].key if name in inputs else None) for name in sources
+    )
+    return None if shared and not is_same else version
 
 
 def products(inputs: RenderInputs) -> Plan:

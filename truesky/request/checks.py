@@ -21,7 +21,7 @@ from truesky.request.toml_values import Toml, as_table, number, quote_value, str
 # Largest distance in degrees from the area to a pointing that may belong to it.
 _NEAR_AREA = 3.0
 # Keys of the section `universe` that only select or count sources that truesky draws.
-_DRAWN_SOURCES = ("galaxy_limit", "galaxy_band", "star_limit", "high_redshift_boost", "quasar_boost")
+_DRAWN_SOURCES = ("galaxy_limit", "galaxy_band", "star_limit", "high_redshift_boost", "quasar_boost", "variables")
 # Starts of messages about mission parameters.
 _OVERRIDE, _PARAMETER = "mission override ", "mission parameter "
 

@@ -13,6 +13,9 @@ All keys::
                    high_redshift_boost, quasar_boost, alignment
                    lensing = "box" | "none" | {g1, g2}   constant reduced shear of all galaxies, frame (east, north)
                    rotation       deg, added to the position angle of every galaxy before lensing
+                   transients = {start, end, kinds = ["ia", "core_collapse"], boost, light_curves = "file.parquet"}
+                                  supernovae that shine between two dates (MJD), default: none
+                   variables = true | false   stars and active nuclei vary, default: false
     [universe.cosmology]  omega_m, omega_b, h, sigma_8, n_s, w0, wa   flat universe, by default that of Flagship
                    m_nu           sum of the masses of three equal neutrinos, eV, default: 0
                    power = "camb" | "eisenstein98"   source of the linear power spectrum
@@ -104,7 +107,7 @@ from lake_schema.errors import BadInput, Mistakes, bad_input
 from lake_schema.store import layout
 from truesky.request import area as areas
 from truesky.request import bands as request_bands
-from truesky.request import checks, files, instruments, lensing_resolution, request_lines, structure
+from truesky.request import checks, files, instruments, lensing_resolution, request_lines, structure, transients
 from truesky.request.accuracy import ALLOWED, SURVEY, Accuracy, fastest_row, preset
 from truesky.request.area import Area
 from truesky.request.exposures import observations, pointings
@@ -312,7 +315,8 @@ def _values(reader: RequestReader, folder: Path, area: Area | None) -> dict[str,
     products, solar_system, lenses = (reader.section(key) for key in ("products", "solar_system", "strong_lenses"))
     accuracy = read("accuracy", _accuracy, table.get("accuracy"), "accuracy") or SURVEY
     nside = Universe().lensing_nside if area is None else lensing_resolution.default_nside(area, accuracy)
-    universe = read("universe", _universe, reader.section("universe"), nside)
+    universe_table = reader.section("universe")
+    universe = read("universe", _universe, universe_table, nside)
     star_limit = math.inf if universe is None else universe.star_limit
     values = {
         "name": read("name", _name, table) or "request",
@@ -322,6 +326,7 @@ def _values(reader: RequestReader, folder: Path, area: Area | None) -> dict[str,
         else None,
         "accuracy": accuracy,
         "universe": universe,
+        "transients": read("universe", transients.parse, universe_table.get("transients"), folder),
         "stars": read("stars", _stars, reader.section("stars"), folder, star_limit),
         "effects": read("effects", _effects, reader.section("effects")),
         "ingest": read("ingest", files.parse_ingest, reader.section("ingest"), folder),
@@ -413,6 +418,7 @@ def _universe(table: Toml, lensing_nside: int) -> Universe:
             alignment=read(_number, table, "universe.alignment", 0.0, 10.0, default.alignment),
             rotation=read(_number, table, "universe.rotation", -360.0, 360.0, default.rotation, "deg"),
             cosmology=read(checks.parse_cosmology, table.get("cosmology", {})),
+            variables=read(_boolean, table, "universe.variables", default.variables),
         )
     return universe
 

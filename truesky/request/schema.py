@@ -18,6 +18,7 @@ from truesky.request.exposures.observations import Observation
 from truesky.request.exposures.pointings import Pointing
 from truesky.request.files import Ingest, UserCurves, UserSources
 from truesky.request.structure import Structure
+from truesky.request.transients import Transients
 
 if TYPE_CHECKING:
     from lake_schema.mission.camera_folder import Camera
@@ -94,6 +95,9 @@ class Universe:
         Number density of high-redshift galaxies, and of quasars, relative to nature; 0 for none.
     cosmology : Cosmology
         Parameters of the cosmology.
+    variables : bool
+        True for variable stars and active nuclei. The table `stars` then has the columns of light curves, quasars are
+        in halos, and active galaxies have narrow lines.
     """
 
     galaxy_limit: float = 26.0
@@ -109,6 +113,7 @@ class Universe:
     high_redshift_boost: float = 1.0
     quasar_boost: float = 1.0
     cosmology: Cosmology = FIDUCIAL
+    variables: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,6 +231,8 @@ class Request:
         User catalogues and maps that replace simulated ones.
     strong_lens_boost : float
         Number density of strong lenses relative to nature.
+    transients : Transients, optional
+        Supernovae that explode during a window of time; None for none.
     compression : str
         Compression of integer images, one of `COMPRESSIONS`.
     wcs : str, optional
@@ -279,6 +286,7 @@ class Request:
     explore: tuple[tuple[str, tuple[str, ...]], ...] = ()
     ingest: Ingest = _NO_INGEST
     strong_lens_boost: float = 1.0
+    transients: Transients | None = None
     compression: str = "none"
     wcs: str | None = None
     files: str = "detector"
@@ -303,6 +311,9 @@ class Request:
         Raises KeyError if there is no such field.
         """
         all_values = asdict(self)
+        # Without variable sources, the facts must be as before this key existed, so that hashes do not change.
+        if not self.universe.variables:
+            del all_values["universe"]["variables"]
         # A camera is identified by the contents of its folder, not by its path.
         all_values["mission"]["cameras"] = {camera.name: camera.sha256 for camera in self.mission.cameras}
         return {name: all_values[name] for name in names}

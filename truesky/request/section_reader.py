@@ -20,7 +20,7 @@ _Result = TypeVar("_Result")
 # Keys of each section; () for a section that may have any key, or whose keys another module checks.
 _SECTIONS: dict[str, tuple[str, ...]] = {
     "area": (),
-    "universe": Universe.__slots__,
+    "universe": (*Universe.__slots__, "transients"),
     "stars": tuple(key for key in Stars.__slots__ if key != "columns"),
     "ingest": ("galaxies", "halos", "training", "dust"),
     "sources": ("only", *UserSources.__slots__),

@@ -20,7 +20,7 @@ from lake_schema.tables.exposures import GRISM_NAMES
 from truesky.request.toml_values import Toml, checked_number, has_key, quote_value, required_value
 
 # First and last date (MJD) that a request may contain: 1968 to 2132.
-MJD_LIMITS = (40_000.0, 100_000.0)
+MJD_LIMITS = (40_000.0, 98_000.0)
 # Limits of a right ascension and of a declination in degrees.
 RA_LIMITS, DEC_LIMITS = (-360.0, 360.0), (-90.0, 90.0)
 # Units in which a sexagesimal text is read.

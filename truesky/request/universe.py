@@ -76,11 +76,15 @@ def _difference(version: read.Version, request: Request) -> str:
         return "other sources than the request"
     # Compare only values that the manifest (JSON description) of the catalogue contains. For a user's catalogue, for
     # example, the manifest has no limiting magnitude. Galaxies without a cosmology have the only one when they were
-    # made, and drawn ones had no structure below the cells of the box then.
+    # made, and drawn ones had no structure below the cells of the box then. Drawn stars without this fact are constant.
     if version.table == "galaxies":
         facts = {"cosmology": asdict(UNNAMED), **facts}
     if "box_cells" in facts:
         facts = {"structure_below_cells": False, **facts}
+    # Tables without this key have constant stars, no narrow lines of active nuclei, and random positions of quasars.
+    is_drawn = "box_cells" in facts or (version.table == "stars" and "star_limit" in facts)
+    if is_drawn and bool(facts.get("variables")) is not request.universe.variables:
+        return f"variables {bool(facts.get('variables'))}, the request {request.universe.variables}"
     for key in ("seed", *(key for key in values if key in facts and key != "seed")):
         if key == "cosmology":
             if different := _different_parameter(facts[key], values[key], is_drawn="box_cells" in facts):

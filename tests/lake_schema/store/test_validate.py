@@ -13,7 +13,7 @@ from lake_schema.store import manifest, parquet, validate
 from lake_schema.tables import all_tables
 from tests.universe import TOY, rows_of, toy_rows
 
-TABLES = all_tables(["euclid_vis", "lsst_r"])
+TABLES = all_tables(["euclid_vis", "lsst_r"], variables=True)
 each_table = pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
 # Tables for tests that change every column. Together they have every type of column; the others are checked at night.
 VARIED = ("stars", "exposures", "tasks", "rendered_spectra", "galaxy_fluxes", "templates")

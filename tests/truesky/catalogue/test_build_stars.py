@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
+from astropy.table import Table
 
 from lake_schema import ids, sky
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, publish, read
+from lake_schema.tables import stars
 from tests import hats_readers, requests
 from truesky.catalogue import build_stars
+from truesky.catalogue.exports import fits_files
 from truesky.fluxes import compute_fluxes
 from truesky.render.planning import preconditions
 from truesky.request.from_toml import from_table
@@ -89,6 +92,24 @@ def test_fluxes_lie_beside_their_stars(versions):
     preconditions.refuse_uncovered(mixed, set(cells))
     with pytest.raises(BadInput, match="lacks 1 order-8 cells"):
         preconditions.refuse_uncovered(mixed, {*cells, 0})
+
+
+def test_variable_stars_change_no_other_column(versions, tmp_path):
+    """Without them, facts and schema of the table have no trace of them, so that its key and bytes stay the same."""
+    variable = made(tmp_path / "lake", universe={"star_limit": 14.0, "variables": True})
+    plain = versions[0]
+    assert "variables" not in plain.manifest["facts"]
+    assert plain.schema.names == stars.STARS.names
+    assert variable.manifest["facts"]["variables"] is True
+    assert variable.schema.names == stars.stars(True).names
+    assert variable.rows(stars.STARS.names).equals(plain.rows())
+    assert hats_readers.is_valid(variable.folder)
+    assert read.find_faults(variable, deep=True) == []
+    code = variable.rows(["variability"])["variability"].drop_null().to_numpy()
+    assert set(np.unique(code)) > {5, 6}
+    fits_files.write(tmp_path / "lake", stars.STARS, tmp_path / "fits")
+    written = Table.read(next((tmp_path / "fits").iterdir()))
+    assert {"variability", "tidal_amplitude"} <= set(written.colnames)
 
 
 def test_crowded_areas_are_refused_before_any_work(lake, tmp_path, capsys):

@@ -45,6 +45,8 @@ WITH_DEFAULT = {
     "truesky/catalogue/injected_rows.py",
     # Names of columns in the format of Euclid, which do not depend on the cosmology.
     "truesky/catalogue/exports/euclid.py",
+    # Rates in a galaxy are calibrated with the shipped densities of hosts, in the default cosmology.
+    "truesky/catalogue/transients/rates.py",
     "truesky/validation/model/census.py",
     "truesky/validation/model/pictures.py",
 }

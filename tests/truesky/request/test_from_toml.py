@@ -91,6 +91,7 @@ BAD = [
     ("universe", {"lensing": {"g1": 0.1, "g2": float("nan")}}, "universe.lensing.g2"),
     ("universe", {"rotation": 400}, "universe.rotation"),
     ("universe", {"structure_below_cells": 1}, "universe.structure_below_cells"),
+    ("universe", {"variables": "yes"}, "universe.variables"),
     ("universe", {"cosmology": 3}, "universe.cosmology must be a table"),
     ("universe", {"cosmology": {"omega_c": 0.2}}, "universe.cosmology.omega_c is not a key of a request"),
     ("universe", {"cosmology": {"h": 67}}, r"universe.cosmology.h = 67 is outside .*: did you mean 0.67\?"),

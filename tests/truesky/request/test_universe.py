@@ -83,6 +83,22 @@ def test_message_names_the_difference_between_universes(lake, table, other, word
         universe.check_catalogues([version], other)
 
 
+def test_variable_stars_are_another_universe():
+    """Catalogues without this fact have constant stars; galaxies do not depend on it."""
+    assert "variables" not in keys()["galaxies"] | keys()["stars"]
+    constant, variable = wanted(), wanted(variables=True)
+    old = {"seed": 11, "star_limit": constant.universe.star_limit}
+    stars, galaxies = (SimpleNamespace(table=table, manifest={"facts": old}) for table in ("stars", "ingested"))
+    universe.check_catalogues([stars, galaxies], constant)
+    universe.check_catalogues([galaxies], variable)
+    with pytest.raises(BadInput, match="table stars has variables False, the request True"):
+        universe.check_catalogues([stars], variable)
+    new = SimpleNamespace(table="stars", manifest={"facts": {**old, "variables": True}})
+    universe.check_catalogues([new], variable)
+    with pytest.raises(BadInput, match="table stars has variables True, the request False"):
+        universe.check_catalogues([new], constant)
+
+
 def test_galaxies_of_earlier_versions_are_another_universe():
     """They name neither the cosmology nor the structure below the cells of the box, which they did not have."""
     old = SimpleNamespace(table="galaxies", manifest={"facts": {"seed": 11, "box_cells": wanted().universe.box_cells}})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lake_schema import tables
 from lake_schema.columns import Table
 from lake_schema.fits.tables import table_to_fits
 from lake_schema.store import layout, read
@@ -29,6 +30,8 @@ def write(lake: Path, declared: Table, folder: Path, request: str | None = None)
         Files written.
     """
     version = read.version(lake, declared.name, request=request)
+    # The table of the lake may have optional columns: the light curves of variable stars.
+    declared = tables.find_table(declared.name, version.schema.names) or declared
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for partition in version.partitions:

@@ -15,7 +15,7 @@ from lake_schema.columns import Table
 from lake_schema.errors import BadInput
 from lake_schema.fits.tables import table_to_fits
 from lake_schema.store import read
-from lake_schema.tables.gaia import EXPORT, EXPORT_DR3, PARAMETERS
+from lake_schema.tables.gaia import EXPORT, EXPORT_DR3, PARAMETERS, VARIABLE_FLAG, with_variable_flag
 from truesky.catalogue import parameters
 from truesky.catalogue.exports import ldac
 from truesky.catalogue.stars import gaia
@@ -38,7 +38,7 @@ def write(
     path : Path
         File to write. It must end in .csv or .fits for the form "table", and in .fits, .cat or .ldac for "ldac".
     declared : Table
-        Columns to write with the form "table".
+        Columns to write with the form "table"; phot_variable_flag is added if the lake has variable stars.
     form : str
         "table" or "ldac" (FITS_LDAC for SCAMP).
     epoch : float, optional
@@ -62,6 +62,8 @@ def write(
     if epoch is not None and not 1900.0 <= epoch <= 2100.0:
         raise BadInput(f"--epoch {epoch:g}: give a year from 1900 to 2100")
     version = read.version(lake, "gaia", request=request)
+    if VARIABLE_FLAG.name in version.schema.names:
+        declared = with_variable_flag(declared)
     tables = (_release_columns(version, partition, epoch) for partition in version.partitions)
     if form == "ldac":
         ldac.write(path, pa.concat_tables(list(tables)))

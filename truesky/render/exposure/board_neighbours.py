@@ -30,7 +30,7 @@ from truesky.render.exposure import scene_factory, visible_sources
 from truesky.render.exposure.records import NeighbourDetector, Rows, Variant
 from truesky.render.exposure.visible_sources import Light
 from truesky.render.psf.model import Psf
-from truesky.render.sources import catalogue_rows, selection
+from truesky.render.sources import catalogue_rows, selection, varying_stars
 from truesky.render.sources.galaxy_shapes import shapes
 from truesky.render.sources.source_list import Sources
 
@@ -118,10 +118,9 @@ def bright_stars(inputs: Mapping[str, read.Version], aim: Aim, variant: Variant)
         return ()
     min_flux = _noticeable_electrons(scene_factory.from_aim(aim, variant)) / electrons
     neighbours = other_detectors(exposure.camera, aim.detector.name, variant.mission)
+    columns = varying_stars.add_columns(visible_sources.STAR_COLUMNS, inputs["stars"].schema.names)
     queries = [
-        catalogue_rows.BrightQuery(
-            detector_circle(exposure, neighbour), visible_sources.STAR_COLUMNS, exposure.band, min_flux
-        )
+        catalogue_rows.BrightQuery(detector_circle(exposure, neighbour), columns, exposure.band, min_flux)
         for neighbour in neighbours
     ]
     tables = catalogue_rows.read_bright(inputs["stars"], inputs["star_fluxes"], queries)
@@ -236,11 +235,11 @@ def _select_stars(
     `neighbour_aim` is the exposure with the other detector, and `neighbour` contains its catalogue stars.
     """
     exposure, detector = neighbour_aim.exposure, neighbour_aim.detector
-    middle = exposure.mjd + 0.5 * exposure.exposure_time_s / 86400.0
+    middle = exposure.middle_mjd
     moved = catalogue_rows.apply_proper_motion(neighbour.stars, middle)
+    fluxes = varying_stars.fluxes_at(moved, neighbour.fluxes, {exposure.band: neighbour_aim.band}, middle)
     electrons = (
-        visible_sources.row_fluxes(moved, neighbour.fluxes, f"f_nu_{exposure.band}")
-        * neighbour_aim.electrons_per_microjansky
+        visible_sources.row_fluxes(moved, fluxes, f"f_nu_{exposure.band}") * neighbour_aim.electrons_per_microjansky
     )
     column, row = astrometry.pixel_of_sky(neighbour_aim.wcs, moved["ra"].to_numpy(), moved["dec"].to_numpy())
     on_detector = selection.overlaps_frame(column, row, np.zeros(len(column)), detector.nx, detector.ny)

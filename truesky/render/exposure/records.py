@@ -14,7 +14,9 @@ from truesky.fluxes.libraries.templates import Library
 from truesky.render.camera.detectors import Detector
 from truesky.render.sources.disc_structure import DiscStructure
 from truesky.render.sources.galaxy_stamps import GalaxyStamps
+from truesky.render.sources.nuclei import Nuclei
 from truesky.render.sources.solar_system import Population
+from truesky.render.sources.transients import Transients
 from truesky.request.accuracy import Accuracy
 
 
@@ -49,6 +51,13 @@ class Rows:
     bulge_fractions : float array, shape (n,), optional
         Fraction of each galaxy's light in its bulge in the catalogue, the same in all bands. By default the fraction in
         `galaxies`.
+    transients : Transients, optional
+        Supernovae around the detector; None without.
+    nuclei : Nuclei, optional
+        Active nuclei, varying quasars and lensed quasars around the detector; None without.
+    own_spectra : float array, shape (m, w), optional
+        f_lambda, on any scale, of the last m stars at the w wavelengths of the exposure's band. Other stars have
+        the spectra of templates. None if all have.
     neighbours : tuple of NeighbourDetector
         Other detectors on the same readout board, with their bright stars, for crosstalk.
     """
@@ -66,6 +75,9 @@ class Rows:
     discs: DiscStructure | None = None
     stamps: GalaxyStamps | None = None
     bulge_fractions: Float | None = None
+    transients: Transients | None = None
+    nuclei: Nuclei | None = None
+    own_spectra: Float | None = None
     neighbours: tuple[NeighbourDetector, ...] = ()
 
 

@@ -10,12 +10,9 @@ Euclid Collaboration: Serrano et al. 2024 (stars, their magnitudes, and the five
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from lake_schema import sky, units
 from lake_schema.arrays import Float
@@ -28,6 +25,7 @@ from truesky.fluxes.libraries import standards, templates
 from truesky.render.camera import astrometry, pointing
 from truesky.render.channels.aim import Aim
 from truesky.render.exposure.records import Rows
+from truesky.render.sources.point_light import append_rows
 
 # For each image type with a calibration target: the name of the parameter in the mission database with the AB magnitude
 # of the target, and the band of this magnitude ("" for the band of the exposure).
@@ -103,8 +101,8 @@ def with_standards(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
     star = {"id": ids, "ra": ra, "dec": dec, "sed": sed, "mag_h": magnitude, "a_v": 0.0}
     return replace(
         rows,
-        stars=_append_rows(rows.stars, star),
-        star_fluxes=_append_rows(rows.star_fluxes, {"id": ids, f"f_nu_{aim.exposure.band}": f_nu}),
+        stars=append_rows(rows.stars, star),
+        star_fluxes=append_rows(rows.star_fluxes, {"id": ids, f"f_nu_{aim.exposure.band}": f_nu}),
     )
 
 
@@ -129,17 +127,3 @@ def star_positions(aim: Aim, mission: MissionConfiguration) -> tuple[Float, Floa
         return pointing.sky_of_plane([0.0], [offset_arcsec], exposure.ra, exposure.dec, exposure.position_angle)
     x, y = np.array(_PLACES_OF_HALVES if aim.detector.injection_rows else _PLACES).T
     return astrometry.sky_of_pixel(aim.wcs, x * (nx - 1), y * (ny - 1))
-
-
-def _append_rows(table: pa.Table, values: Mapping[str, Any]) -> pa.Table:
-    """Return the table with additional rows; `values` contains their columns, and `values["id"]` their identifiers.
-
-    A value that is not an array is repeated in all additional rows. Columns that `values` lacks are null.
-    """
-    n = len(values["id"])
-    columns = [
-        pa.array(np.broadcast_to(values[field.name], n)).cast(field.type) if field.name in values
-        else pa.nulls(n, field.type)
-        for field in table.schema
-    ]  # fmt: skip
-    return pa.concat_tables([table, pa.table(columns, schema=table.schema)])

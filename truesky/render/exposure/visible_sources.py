@@ -12,7 +12,7 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.strong_lenses import STRONG_LENSES
-from truesky.fluxes import bulges
+from truesky.fluxes import bulges, passbands
 from truesky.fluxes.libraries import templates
 from truesky.fluxes.passbands import Passband
 from truesky.render.camera import astrometry
@@ -37,8 +37,12 @@ from truesky.render.sources import (
     galaxy_shapes,
     galaxy_stamps,
     lensed_arcs,
+    nuclei,
+    point_light,
     selection,
     solar_system,
+    transients,
+    varying_stars,
 )
 from truesky.render.sources.source_list import Sources
 
@@ -224,20 +228,47 @@ def rows_at_exposure(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Row
     Returns
     -------
     Rows
-        Rows with the bulge fractions of the exposure's band, with the positions of stars in the middle of the exposure,
-        and with the standard star of the exposure if it has one.
+        Rows with the bulge fractions of the exposure's band, with the positions and the fluxes of stars in the middle
+        of the exposure, with the standard star of the exposure if it has one, and with the supernovae that shine then.
 
     Notes
     -----
     BadInput is raised by `with_standards` if the target of a calibration is not a standard star.
     """
-    middle = aim.exposure.mjd + 0.5 * aim.exposure.exposure_time_s / 86400.0
+    middle = aim.exposure.middle_mjd
     galaxies = bulges.with_fractions_in_band(rows.galaxies, aim.band, rows.galaxy_library or templates.galaxy_library())
     shares = np.asarray(rows.galaxies["bulge_fraction"].to_numpy(), float)
+    bands = _bands_of_fluxes(rows.star_fluxes, aim)
+    galaxy_fluxes = rows.galaxy_fluxes
+    if rows.nuclei is not None:
+        galaxy_fluxes = nuclei.quasar_fluxes(galaxy_fluxes, rows.nuclei.quasars, bands, middle)
     rows = replace(
-        rows, galaxies=galaxies, stars=catalogue_rows.apply_proper_motion(rows.stars, middle), bulge_fractions=shares
+        rows,
+        galaxies=galaxies,
+        galaxy_fluxes=galaxy_fluxes,
+        stars=catalogue_rows.apply_proper_motion(rows.stars, middle),
+        star_fluxes=varying_stars.fluxes_at(rows.stars, rows.star_fluxes, bands, middle),
+        bulge_fractions=shares,
     )
-    return standard_stars.with_standards(rows, aim, mission)
+    rows = standard_stars.with_standards(rows, aim, mission)
+    return _with_changing_points(rows, aim, middle)
+
+
+def _with_changing_points(rows: Rows, aim: Aim, mjd: float) -> Rows:
+    """Add the supernovae and active nuclei that shine at a date to the stars, with their own spectra at the end."""
+    points = [] if rows.transients is None else [transients.light_at(rows.transients, aim.band, mjd)]
+    points += [] if rows.nuclei is None else [nuclei.light_at(rows.nuclei, aim.band, mjd)]
+    for light in points:
+        stars, fluxes = point_light.append_points(rows.stars, rows.star_fluxes, light, aim.exposure.band)
+        spectra = light.spectra if rows.own_spectra is None else np.concatenate([rows.own_spectra, light.spectra])
+        rows = replace(rows, stars=stars, star_fluxes=fluxes, own_spectra=spectra)
+    return rows
+
+
+def _bands_of_fluxes(fluxes: pa.Table, aim: Aim) -> dict[str, Passband]:
+    """Return the passbands of the columns of a table of fluxes: the exposure's, and a built-in one if any."""
+    names = [name.removeprefix("f_nu_") for name in fluxes.column_names if name.startswith("f_nu_")]
+    return {name: aim.band if name == aim.exposure.band else passbands.load(name) for name in names}
 
 
 def exposure_psf(aim: Aim, scene: Scene, settings: Settings) -> Psf:
@@ -561,9 +592,12 @@ def _photon_fractions(spectrum_rows: Int, rows: Rows, band: Passband) -> Float:
     of_galaxy = spectrum_rows < len(rows.galaxies)
     out = np.empty((len(spectrum_rows), sub_bands.N_SUB_BANDS))
     out[of_galaxy] = colours.galaxies(rows.galaxies.take(spectrum_rows[of_galaxy]), band, rows.galaxy_library)
-    out[~of_galaxy] = colours.stars(
-        rows.stars.take(spectrum_rows[~of_galaxy] - len(rows.galaxies)), band, rows.stellar_library
-    )
+    star = spectrum_rows[~of_galaxy] - len(rows.galaxies)
+    out[~of_galaxy] = colours.stars(rows.stars.take(star), band, rows.stellar_library)
+    if rows.own_spectra is not None:
+        spectrum = star - (len(rows.stars) - len(rows.own_spectra))
+        for source, row in zip(np.flatnonzero(~of_galaxy)[spectrum >= 0], spectrum[spectrum >= 0], strict=True):
+            out[source] = colours.spectrum_fractions(band, rows.own_spectra[row])
     return out
 
 

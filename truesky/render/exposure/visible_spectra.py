@@ -85,7 +85,13 @@ def visible_spectra(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     sources = replace(sources, electrons=sources.electrons * let_through)
     sun = solar_irradiance(band.wavelength / 10.0, mission)
     source_spectra = spectra.spectrum_function(
-        spectrum_rows, rows.galaxies, rows.stars, band, sun, (rows.galaxy_library, rows.stellar_library)
+        spectrum_rows,
+        rows.galaxies,
+        rows.stars,
+        band,
+        sun,
+        (rows.galaxy_library, rows.stellar_library),
+        rows.own_spectra,
     )
     nodes = images.nodes(order_traces[0].first, order_traces[0].last, settings.nodes)
     psf = dispersion.psf(aim.detector, nodes, mission, settings.positions)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -33,10 +33,11 @@ WORKERS = 2
 _TABLES_OF_JOB = {
     "build_galaxies": ("halos", "galaxies"),
     "build_stars": ("stars",),
+    "build_transients": ("transients",),
     "compute_fluxes": ("galaxy_fluxes", "star_fluxes"),
 }
 _CATALOGUE_OF_FLUXES = {"galaxy_fluxes": "galaxies", "star_fluxes": "stars"}
-_TABLES = ("halos", "galaxies", "stars", *_CATALOGUE_OF_FLUXES)
+_TABLES = ("halos", "galaxies", "stars", "transients", *_CATALOGUE_OF_FLUXES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +79,10 @@ def for_request(request: Request, factor: float = 1.0) -> list[Line]:
     """
     cells = request.area.cells()
     rows = _drawn_rows(request, cells) if request.sources is None else _given_rows(request.sources, request.area)
+    transients = request.transients
+    if transients is not None and "galaxies" in rows and request.sources is None:
+        window = asdict(transients)
+        rows["transients"] = _transient_count(euclid_limit(request.universe), len(cells), window)
     partition_counts = dict.fromkeys(rows, _file_count(cells, FILE_ORDER))
     if "stars" in rows:
         partition_counts["stars"] = max(
@@ -125,6 +130,14 @@ def _forecast_versions(versions: Mapping[str, read.Version], factor: float, new_
             mission = mission_of(MissionChoice())
             rows[name] = _star_count(Densities(mission, Universe(star_limit=facts["star_limit"])), cells)
         bands |= {name: len(facts["bands"])} if "bands" in facts else {}
+    if "transients" in versions and "galaxies" in rows:
+        cells = [
+            cell for part in versions["transients"].manifest["parts"] for cell in part["facts"]["generation_cells"]
+        ]
+        galaxy_facts = versions["galaxies"].manifest["facts"]
+        limits = {key: galaxy_facts[key] for key in ("galaxy_limit", "galaxy_band") if key in galaxy_facts}
+        window = versions["transients"].manifest["facts"]
+        rows["transients"] = _transient_count(euclid_limit(Universe(**limits)), len(cells), window)
     partition_counts = {name: len(version.partitions) for name, version in versions.items()}
     return _make_lines(rows, partition_counts, bands, factor, new_tables)
 
@@ -181,6 +194,19 @@ def _galaxy_counts(limit: float, cells: int) -> dict[str, float]:
     s = (limit - limits[i]) / (limits[i + 1] - limits[i])
     logs = {name: np.log(table[name]) for name in ("halos", "galaxies")}
     return {name: area * float(np.exp((1 - s) * log[i] + s * log[i + 1])) for name, log in logs.items()}
+
+
+def _transient_count(limit: float, cells: int, window: Mapping[str, Any]) -> float:
+    """Return the expected number of supernovae in galaxies brighter than a limit in I_E in `cells` order-8 cells.
+
+    `window` has the first and last date `start` and `end` (MJD), the `kinds` of supernovae and the `boost` of the rate.
+    """
+    table, area = _costs()["drawn"], cells * sky.cell_area(GENERATION_ORDER)
+    a_day, days = (
+        float(np.interp(limit, table["limits"], values))
+        for values in (np.sum([table[kind] for kind in window["kinds"]], axis=0), table["days"])
+    )
+    return float(area * a_day * window["boost"] * (window["end"] - window["start"] + days))
 
 
 def _star_count(densities: Densities, cells: Sequence[int]) -> float:

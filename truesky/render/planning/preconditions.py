@@ -12,15 +12,19 @@ from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.store import read
+from lake_schema.store.plan import Json
 from lake_schema.store.provenance import canonical
 from truesky.render.camera import pointing
 from truesky.render.channels import registry
 from truesky.render.planning.mission import PLAN_SECTIONS, user_filters
 from truesky.render.sources import catalogue_rows, selection
 from truesky.render.sources.catalogue_rows import CATALOGUES, FARTHEST_MOVED, LENSES
+from truesky.render.sources.nuclei import ACTIVE_NUCLEI
+from truesky.render.sources.transients import LENSED_IMAGES, TRANSIENTS
 from truesky.request import universe
 from truesky.request.area import Area
 from truesky.request.schema import Request
+from truesky.variability import spectral_series
 
 # If the area of a request is too small, the error message suggests circles on the sky that contain all detectors.
 # Detectors within this distance (deg) share a circle.
@@ -62,12 +66,34 @@ def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request, miss
         raise BadInput("table mission was planned for another request: run plan_exposures first")
     if LENSES in inputs and facts[LENSES].get("galaxies") != inputs["galaxies"].key:
         raise BadInput(f"table {LENSES} was drawn in another version of galaxies: run build_strong_lenses first")
+    if ACTIVE_NUCLEI in inputs and facts[ACTIVE_NUCLEI].get("galaxies") != inputs["galaxies"].key:
+        raise BadInput(f"table {ACTIVE_NUCLEI} was drawn in another version of galaxies: run build_active_nuclei first")
+    if LENSED_IMAGES in inputs:
+        for name in (LENSES, TRANSIENTS):
+            if facts[LENSED_IMAGES].get(name) != (inputs[name].key if name in inputs else None):
+                raise BadInput(f"table {LENSED_IMAGES} was made with another {name}: run build_lensed_images first")
+    if TRANSIENTS in inputs:
+        _refuse_other_transients(facts[TRANSIENTS], inputs["galaxies"].key, request)
     for catalogue, fluxes in CATALOGUES:
         if facts[fluxes].get("input") != inputs[catalogue].key:
             raise BadInput(f"table {fluxes} was computed from another version of {catalogue}: run compute_fluxes first")
         for key, sha256 in filters.get("files", {}).items():
             if facts[fluxes]["files"].get(key) != sha256:
                 raise BadInput(f"table {fluxes} was computed with another {key}: run compute_fluxes first")
+
+
+def _refuse_other_transients(facts: Json, galaxies: str, request: Request) -> None:
+    """Raise BadInput if the table `transients` was drawn in other galaxies, or for another window of time."""
+    settings = request.transients
+    assert settings is not None
+    expected: dict[str, object] = {
+        "galaxies": galaxies, "start": settings.start, "end": settings.end, "boost": settings.boost,
+        "kinds": list(settings.kinds),
+    }  # fmt: skip
+    expected |= spectral_series.facts(settings.light_curves) or {"light_curves": None}
+    for key, value in expected.items():
+        if canonical(facts.get(key)) != canonical(value):
+            raise BadInput(f"table {TRANSIENTS} was drawn with another {key}: run build_transients first")
 
 
 def require_renderable_tasks(exposures: pa.Table, tasks: pa.Table) -> pa.Table:

@@ -27,6 +27,7 @@ from truesky.render.planning import variants
 from truesky.render.psf import from_file
 from truesky.render.sources import catalogue_rows, ephemerides, galaxy_stamps, selection
 from truesky.render.sources.catalogue_rows import CATALOGUES, CELLS, FARTHEST, LENSES
+from truesky.render.sources.transients import CHANGING_TABLES, TRANSIENTS
 from truesky.request.accuracy import SURVEY
 
 # Function of an exposure and the name of a detector. It returns the checksums of the catalogue files of stars on
@@ -68,13 +69,15 @@ def product_keys(
     flux_facts = inputs["galaxy_fluxes"].manifest["facts"]
     shared = {key: facts[key] for key in ("request", "mission", "code")}
     shared["library"] = [flux_facts.get("files"), flux_facts.get("sources")]
+    if TRANSIENTS in inputs and (series := inputs[TRANSIENTS].manifest["facts"].get("light_curves")):
+        shared["light_curves"] = series["sha256"]
     rows = {row.exposure_id: row for row in map(ExposureRow.from_row, exposures.to_pylist())}
     files = {
         name: (catalogue_rows.max_deflection(inputs[name]), _files_of_cells(inputs[name], inputs[fluxes]))
         for name, fluxes in CATALOGUES
     }
-    if LENSES in inputs:
-        files[LENSES] = catalogue_rows.max_deflection(inputs["galaxies"]), _files_of_cells(inputs[LENSES])
+    for name in filter(inputs.__contains__, (LENSES, *CHANGING_TABLES)):
+        files[name] = catalogue_rows.max_deflection(inputs["galaxies"]), _files_of_cells(inputs[name])
 
     def catalogue_files(task: Json) -> list[list[tuple[str, ...]]]:
         exposure, detector = rows[task["exposure_id"]], task["detector"]
@@ -87,7 +90,7 @@ def product_keys(
         if channel.diffraction_edges is not None or channel.dispersion is not None:
             reaches["stars"] = max(FARTHEST, reach)
         if channel.dispersion is not None:
-            reaches[LENSES] = max(FARTHEST, reach)
+            reaches |= dict.fromkeys((LENSES, *CHANGING_TABLES), max(FARTHEST, reach))
         checksums = []
         for name, (deflection, files_by_cell) in files.items():
             cells = selection.cells_within_reach(task, deflection, reaches[name])

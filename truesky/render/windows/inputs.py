@@ -17,13 +17,16 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.store import read
 from lake_schema.store.object_storage.s3 import Folder
+from lake_schema.tables.stars import VARIABILITY_COLUMNS
 from truesky.fluxes.inputs import galaxy_library_from_facts, stellar_library_from_facts
 from truesky.render.channels.aim import Aim
 from truesky.render.drawing import stamp_sizes
 from truesky.render.exposure import visible_sources
 from truesky.render.exposure.records import Rows, Variant
-from truesky.render.sources import catalogue_rows
+from truesky.render.sources import catalogue_rows, transients, varying_stars
 from truesky.render.sources.catalogue_rows import LENSES
+from truesky.render.sources.nuclei import read_nuclei
+from truesky.render.sources.transients import read_transients
 from truesky.render.windows.source_blocks import READ_ORDER, Pair, SourceBlocks
 
 # Smallest distance from a window, in arcsec, within which sources of any flux are read. Light beyond the stamps of
@@ -52,7 +55,8 @@ class SkyTables:
     def __init__(self, lake: Folder, versions: Mapping[str, read.Version]) -> None:
         self.versions = versions
         self.galaxies = SourceBlocks(versions["galaxies"], versions["galaxy_fluxes"], visible_sources.GALAXY_COLUMNS)
-        self.stars = SourceBlocks(versions["stars"], versions["star_fluxes"], visible_sources.STAR_COLUMNS)
+        star_columns = varying_stars.add_columns(visible_sources.STAR_COLUMNS, versions["stars"].schema.names)
+        self.stars = SourceBlocks(versions["stars"], versions["star_fluxes"], star_columns)
         # Flux tables are found by the object of a library, so that all windows must use the same object.
         self.galaxy_library = galaxy_library_from_facts(lake, versions["galaxy_fluxes"].manifest["facts"])
         self.stellar_library = stellar_library_from_facts(lake, versions["star_fluxes"].manifest["facts"])
@@ -107,6 +111,8 @@ def read_rows(tables: SkyTables, aim: Aim, variant: Variant) -> Rows:
         stellar_library=tables.stellar_library,
         complete_margin_arcsec=margin,
         lenses=lenses,
+        transients=read_transients(versions, task, ring, limits.min_flux),
+        nuclei=read_nuclei(versions, task, ring, limits.min_flux),
     )
 
 
@@ -157,6 +163,8 @@ def _format_place(ra: float, dec: float) -> str:
 def refuse_unknown(rows: Rows, without: Sequence[int]) -> None:
     """Raise BadInput if a source or arc that is to be left out is not in the catalogue rows around a window."""
     tables = [rows.galaxies, rows.stars, *(() if rows.lenses is None else (rows.lenses,))]
+    tables += [] if rows.transients is None else [rows.transients.rows]
+    tables += [] if rows.nuclei is None else [rows.nuclei.points]
     ids = np.concatenate([table["id"].to_numpy() for table in tables])
     for number in without:
         if number not in ids:
@@ -206,6 +214,8 @@ def select_rows(rows: Rows, without: Sequence[int] = ()) -> Rows:
         stars=rest(rows.stars),
         star_fluxes=rest(rows.star_fluxes),
         lenses=None if rows.lenses is None else rest_of_lenses(rows.lenses),
+        transients=None if rows.transients is None else transients.without(rows.transients, left_out),
+        nuclei=None if rows.nuclei is None else rows.nuclei.without(left_out),
     )
 
 
@@ -231,7 +241,10 @@ def add_rows(rows: Rows, galaxies: Pair, stars: Pair) -> Rows:
     """
 
     def concatenate(table: pa.Table, new: pa.Table) -> pa.Table:
-        # Catalogues without optional columns, such as proper motions, stay without them.
+        # Catalogues without optional columns, such as proper motions, stay without them. Added stars do not vary.
+        for column in VARIABILITY_COLUMNS:
+            if column.name in table.column_names and column.name not in new.column_names:
+                new = new.append_column(column.name, pa.nulls(len(new), column.arrow_type))
         columns = {name: new[name] for name in table.column_names if name in new.column_names}
         if missing := [name for name in table.column_names if name not in columns]:
             raise BadInput(f"sources cannot be added: the lake has a column {missing[0]} that they lack")
