@@ -172,7 +172,7 @@ def _lensed_quasars(query: _Query) -> tuple[Int, Float]:
 
 def _point_fluxes(query: _Query, points: pa.Table) -> Float:
     dates = np.broadcast_to(query.dates, (len(points), len(query.dates)))
-    f_nu, _ = nuclei.point_fluxes(points, query.passband(), dates)
+    f_nu = nuclei.point_fluxes(points, query.passband(), dates)
     return f_nu
 
 

@@ -26,7 +26,7 @@ from truesky.fluxes import passbands
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
 from truesky.fluxes.sources import column, source_ids, table_magnification
-from truesky.fluxes.spectra import extinction, intergalactic
+from truesky.fluxes.spectra import extinction, intergalactic, milky_way
 from truesky.fluxes.spectra.continuum import check_range
 from truesky.numerics import matrices
 
@@ -178,13 +178,38 @@ def spectra(galaxies: pa.Table, first: int = passbands.GRID_FIRST, last: int = p
     OutOfRange
         If a redshift, magnitude, extinction, template number or magnification is out of range.
     """
+    return spectra_at(galaxies, np.arange(first, last + 1.0))
+
+
+def spectra_at(galaxies: pa.Table, wavelength: Float) -> Float:
+    """Return the observed spectra of quasars and high-redshift galaxies at given wavelengths.
+
+    Parameters
+    ----------
+    galaxies : pa.Table
+        Rows as for `spectra`.
+    wavelength : float array, shape (w,)
+        Increasing wavelengths from 600 to 24000 A. Absorption by intergalactic hydrogen is that of bins of 1 A.
+
+    Returns
+    -------
+    float array, shape (n, w)
+        f_lambda in erg s-1 cm-2 A-1.
+
+    Raises
+    ------
+    BadInput
+        If a value is missing, or frac_2 or ebv_1 is not 0. The message names the column and the source.
+    OutOfRange
+        If a redshift, magnitude, extinction, template number or magnification is out of range.
+    """
     kind, z, mag, a_v = (column(galaxies, name) for name in ("kind", "z_obs", "mag_r01", "a_v"))
     sed = column(galaxies, "sed_1").astype(np.int64)
     check_range("z_obs", z, 0.0, Z_MAX)
     check_range("mag_r01", mag, -5.0, 60.0)
     check_range("a_v", a_v, 0.0, 40.0)
     _refuse_mixtures(galaxies)
-    grid, out = np.arange(first, last + 1.0), np.zeros((galaxies.num_rows, last - first + 1))
+    out = np.zeros((galaxies.num_rows, len(wavelength)))
     for code, library in ((QUASAR, quasar_library), (HIGH_REDSHIFT, high_redshift_library)):
         indices = np.flatnonzero(kind == code)
         if not len(indices):
@@ -194,11 +219,12 @@ def spectra(galaxies: pa.Table, first: int = passbands.GRID_FIRST, last: int = p
         factors = template_scale(code, templates, sed[indices], mag[indices], z[indices])
         for i, factor in zip(indices, factors, strict=True):
             spectrum = templates.flux[sed[i]].astype(float)
-            out[i] = factor * np.interp(grid / (1.0 + z[i]), templates.wavelength, spectrum)
+            out[i] = factor * np.interp(wavelength / (1.0 + z[i]), templates.wavelength, spectrum)
         if code == QUASAR:
-            out[indices] *= intergalactic.transmission(grid, z[indices])
+            absorbed = indices[intergalactic.first_transparent(z[indices]) > wavelength[0]]
+            out[absorbed] *= intergalactic.transmission(wavelength, z[absorbed])
     out *= table_magnification(galaxies)[:, None]
-    out *= extinction.transmission(extinction.milky_way_table(first, len(grid)), a_v[:, None])
+    out *= extinction.transmission(milky_way.law(wavelength), a_v[:, None])
     return out
 
 

@@ -97,7 +97,7 @@ def read_sources(
     BadInput
         If there are no fluxes in the band of the exposure, or the user's spectra of supernovae have changed.
     """
-    nearby_nuclei = nuclei.read_nuclei(versions, circle, 0.0, 0.0)
+    nearby_nuclei = nuclei.read_nuclei(versions, circle, 0.0, (0.0, 0.0))
     stars, star_fluxes = _variable_stars(versions, circle, exposed)
     quasar_ids = pa.array([], pa.int64()) if nearby_nuclei is None else nearby_nuclei.quasars["id"]
     cells = _cells(versions["galaxies"], circle)
@@ -108,7 +108,7 @@ def read_sources(
         stars,
         star_fluxes,
         _rows(versions["galaxy_fluxes"], cells, ["id", "ra", "dec", f"f_nu_{exposed.band}"], quasar_ids),
-        transients.read_transients(versions, circle, 0.0, 0.0),
+        transients.read_transients(versions, circle, 0.0, (0.0, 0.0)),
         nearby_nuclei,
         np.zeros(0, np.int64) if lensed is None else lensed["id"].to_numpy(),
     )
@@ -191,7 +191,7 @@ def _nuclear_light(sources: ChangingSources, nearby_nuclei: Nuclei, aim: Aim) ->
     points = _on_detector(nearby_nuclei.points, aim)
     light = nuclei.light_at(Nuclei(points, nearby_nuclei.quasars), aim.band, aim.exposure.middle_mjd)
     shining = points.filter(pa.array(np.isin(points["id"].to_numpy(), light.ids)))
-    mean, _ = nuclei.mean_light(shining, aim.band)
+    mean = nuclei.mean_fluxes(shining, aim.band)
     is_lensed = np.isin(light.ids, sources.lensed)
     return _light(shining, aim, np.where(is_lensed, LENSED_QUASAR, NUCLEUS), light.f_nu, mean)
 

@@ -186,7 +186,7 @@ def _read_rows(
         lenses=lenses,
         bodies=bodies,
         previous_exposures=previous_exposures,
-        transients=read_transients(inputs, task, extra_reach, limits.min_flux),
-        nuclei=read_nuclei(inputs, task, extra_reach, limits.min_flux),
+        transients=read_transients(inputs, task, extra_reach, (limits.min_point_flux, limits.min_flux)),
+        nuclei=read_nuclei(inputs, task, extra_reach, (limits.min_point_flux, limits.min_flux)),
         neighbours=board_neighbours.bright_stars(inputs, aim, variant),
     )

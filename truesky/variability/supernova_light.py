@@ -9,21 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from lake_schema.arrays import Bool, Float, Int
 from lake_schema.units import UJY_CGS
 from truesky.fluxes import passbands
 from truesky.fluxes.passbands import Passband
-from truesky.fluxes.spectra import extinction
+from truesky.fluxes.spectra import extinction, milky_way
 from truesky.numerics import matrices
 from truesky.variability import supernova_templates
 from truesky.variability.supernova_templates import Template
 
-# First wavelength (A) of the extinction law of the host, and number of wavelengths in steps of 1 A.
-_LAW_FIRST, _LAW_COUNT = 900, 23101
-_LAW_WAVELENGTH = np.arange(_LAW_FIRST, _LAW_FIRST + _LAW_COUNT, dtype=float)
+# Number of wavelengths of a template in a block, and number of parts of a band, for upper limits of fluxes.
+_BLOCK, _PARTS = 8, 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,23 +102,89 @@ def fluxes(supernovae: Supernovae, band: Passband, mjd: Float, templates: Mappin
     points of the template.
     """
     dates = np.broadcast_to(mjd, (len(supernovae), np.shape(mjd)[-1]))
-    weights = passbands.weights(band) / UJY_CGS
-    milky_way = extinction.milky_way_table(int(band.wavelength[0]), len(band.wavelength))
     out = np.zeros(dates.shape)
-    for i, kind in enumerate(supernovae.kind):
-        template, z = templates[int(kind)], float(supernovae.z[i])
-        row, share = template.at_phases(_phases(supernovae, i, dates[i]))
-        if not share.any():
-            continue
-        dust = extinction.transmission(milky_way, supernovae.a_v[i])
-        first, node_weights = _weights_of_nodes(template.wavelength, band.wavelength / (1.0 + z), weights * dust)
-        nodes = slice(first, first + len(node_weights))
-        node_weights = node_weights * _colour(template.wavelength[nodes], float(supernovae.ebv[i]))
-        rows = slice(int(row.min()), int(row.max()) + 2)
-        curve = matrices.matmul(np.ascontiguousarray(template.flux[rows, nodes]), node_weights) * _scale(supernovae, i)
-        row_before = row - rows.start
-        out[i] = share[:, 0] * curve[row_before] + share[:, 1] * curve[row_before + 1]
+    for kind in np.unique(supernovae.kind):
+        members, template = np.flatnonzero(supernovae.kind == kind), templates[int(kind)]
+        row, share = template.at_phases(_phases(supernovae.select(members), dates[members]))
+        for i, own_row, own_share in zip(members.tolist(), row, share, strict=True):
+            if not own_share.any():
+                continue
+            nodes, weights = _weights_of_nodes(template.wavelength * (1.0 + supernovae.z[i]), band)
+            weights = weights * _factors(supernovae, i, template, nodes)
+            rows = slice(int(own_row.min()), int(own_row.max()) + 2)
+            curve = matrices.matmul(np.ascontiguousarray(template.flux[rows, nodes]), weights)
+            row_before = own_row - rows.start
+            out[i] = own_share[:, 0] * curve[row_before] + own_share[:, 1] * curve[row_before + 1]
     return out
+
+
+def upper_limits(supernovae: Supernovae, band: Passband, mjd: float, templates: Mapping[int, Template]) -> Float:
+    """Return upper limits of the fluxes of supernovae at one date, which take less time than the fluxes.
+
+    Parameters
+    ----------
+    supernovae : Supernovae
+        The n supernovae.
+    band : Passband
+        The passband.
+    mjd : float
+        The date, MJD.
+    templates : mapping of int to Template
+        Spectra by kind.
+
+    Returns
+    -------
+    float array, shape (n,)
+        f_nu in microjansky; 0 before the first and after the last phase of the template.
+    """
+    out = np.zeros(len(supernovae))
+    for kind in np.unique(supernovae.kind):
+        members, template = np.flatnonzero(supernovae.kind == kind), templates[int(kind)]
+        chosen = supernovae.select(members)
+        row, share = template.at_phases(_phases(chosen, mjd)[:, 0])
+        first, last, flux, least_dust, most_dust = _blocks(template)
+        # Dust of the Milky Way, which is left out, makes fluxes smaller.
+        dust = np.where(chosen.ebv[:, None] > 0.0, least_dust, most_dust)
+        largest = np.maximum(flux[row], flux[row + 1]) * extinction.transmission(dust, chosen.ebv[:, None])
+        stretch, limit = (1.0 + chosen.z)[:, None], np.zeros(len(members))
+        for blue, red, weight in _parts(band):
+            limit += np.where((last * stretch >= blue) & (first * stretch <= red), largest, 0.0).max(axis=1) * weight
+        scale = chosen.magnification * 10.0 ** (-0.4 * chosen.magnitude) / (1.0 + chosen.z)
+        out[members] = np.where(share.any(axis=1), limit * scale, 0.0)
+    return out
+
+
+@lru_cache(maxsize=16)
+def _blocks(template: Template) -> tuple[Float, Float, Float, Float, Float]:
+    """Divide the wavelengths of a template into b blocks, for upper limits of its flux.
+
+    Returns
+    -------
+    (float array, float array, float array, float array, float array)
+        First and last wavelength, A, shape (b,); largest f_lambda by phase, shape (p, b); smallest and largest
+        A(lambda) / E(B-V) in the host (`_host_dust`), shape (b,). A block shares its last wavelength with the next.
+    """
+    start = np.arange(0, len(template.wavelength) - 1, _BLOCK)
+    end = np.minimum(start + _BLOCK, len(template.wavelength) - 1)
+    pieces = [slice(low, high + 1) for low, high in zip(start, end, strict=True)]
+    dust = _host_dust(template)
+    return (
+        template.wavelength[start],
+        template.wavelength[end],
+        np.stack([template.flux[:, piece].max(axis=1) for piece in pieces], axis=1),
+        np.array([dust[piece].min() for piece in pieces]),
+        np.array([dust[piece].max() for piece in pieces]),
+    )
+
+
+@lru_cache(maxsize=32)
+def _parts(band: Passband) -> tuple[tuple[float, float, float], ...]:
+    """Divide a band into parts of equal weight, and return the first and last wavelength (A) and the weight of each."""
+    at, weights = band.wavelength, passbands.weights(band) / UJY_CGS
+    total = np.cumsum(weights)
+    part = np.minimum((total / total[-1] * _PARTS).astype(int), _PARTS - 1)
+    groups = [np.flatnonzero(part == i) for i in np.unique(part)]
+    return tuple((at[group[0]], at[group[-1]], float(weights[group].sum())) for group in groups)
 
 
 def spectra(supernovae: Supernovae, wavelength: Float, mjd: float, templates: Mapping[int, Template]) -> Float:
@@ -128,7 +195,7 @@ def spectra(supernovae: Supernovae, wavelength: Float, mjd: float, templates: Ma
     supernovae : Supernovae
         The n supernovae.
     wavelength : float array, shape (w,)
-        Observed wavelengths, A, in steps of 1 A from a whole number.
+        Observed wavelengths, A, increasing.
     mjd : float
         The date, MJD.
     templates : mapping of int to Template
@@ -139,71 +206,94 @@ def spectra(supernovae: Supernovae, wavelength: Float, mjd: float, templates: Ma
     float array, shape (n, w)
         f_lambda in erg s-1 cm-2 A-1.
     """
-    milky_way = extinction.milky_way_table(int(wavelength[0]), len(wavelength))
     out = np.zeros((len(supernovae), len(wavelength)))
     for i, kind in enumerate(supernovae.kind):
-        template, rest = templates[int(kind)], wavelength / (1.0 + supernovae.z[i])
-        (row,), ((row_before, next_weight),) = template.at_phases(_phases(supernovae, i, np.array([mjd])))
-        spectrum = row_before * template.flux[row] + next_weight * template.flux[row + 1]
-        spectrum = spectrum * _colour(template.wavelength, float(supernovae.ebv[i]))
-        observed = np.interp(rest, template.wavelength, spectrum, left=0.0, right=0.0)
-        out[i] = observed * extinction.transmission(milky_way, supernovae.a_v[i]) * _scale(supernovae, i)
+        template = templates[int(kind)]
+        (row,), ((row_before, next_weight),) = template.at_phases(_phases(supernovae.select(np.array([i])), mjd)[0])
+        observed = template.wavelength * (1.0 + supernovae.z[i])
+        nodes = _nodes_around(observed, wavelength)
+        spectrum = row_before * template.flux[row, nodes] + next_weight * template.flux[row + 1, nodes]
+        spectrum = spectrum * _factors(supernovae, i, template, nodes)
+        out[i] = np.interp(wavelength, observed[nodes], spectrum, left=0.0, right=0.0)
     return out
 
 
-def _phases(supernovae: Supernovae, i: int, mjd: Float) -> Float:
-    """Return the phases of the template of supernova `i` at these dates, days in the rest frame."""
-    slow = (1.0 + supernovae.z[i]) * supernovae.stretch[i]
-    return np.asarray((mjd - supernovae.peak_mjd[i]) / slow, float)
+def _phases(supernovae: Supernovae, mjd: npt.ArrayLike) -> Float:
+    """Return the phases of the templates of n supernovae, days in the rest frame, shape (n, m).
+
+    `mjd` are dates of shape (n, m), or one date.
+    """
+    slow = (1.0 + supernovae.z) * supernovae.stretch
+    return np.asarray((np.asarray(mjd, float) - supernovae.peak_mjd[:, None]) / slow[:, None], float)
 
 
-def _scale(supernovae: Supernovae, i: int) -> float:
-    """Return the factor from the f_lambda of the template to the observed f_lambda.
+def _factors(supernovae: Supernovae, i: int, template: Template, nodes: slice) -> Float:
+    """Return the factors from the f_lambda of a template to the observed f_lambda of supernova `i`.
 
+    They are for the wavelengths of the template with the indices `nodes`, and contain distance, magnification and dust.
     The wavelengths of a redshifted spectrum are stretched, so that f_lambda falls by 1 + z.
     """
-    distance = 10.0 ** (-0.4 * float(supernovae.magnitude[i])) / (1.0 + float(supernovae.z[i]))
-    return float(supernovae.magnification[i] * distance)
+    stretch = 1.0 + float(supernovae.z[i])
+    scale = float(supernovae.magnification[i]) * 10.0 ** (-0.4 * float(supernovae.magnitude[i])) / stretch
+    foreground = milky_way.law(template.wavelength[nodes] * stretch)
+    dust = float(supernovae.a_v[i]) * foreground + float(supernovae.ebv[i]) * _host_dust(template)[nodes]
+    return np.asarray(scale * extinction.transmission(dust, 1.0))
 
 
-def _colour(wavelength: Float, ebv: float) -> Float:
-    """Return the change of a spectrum by dust in the host, relative to the change in the middle of `PEAK_BAND`.
+@lru_cache(maxsize=16)
+def _host_dust(template: Template) -> Float:
+    """Return A(lambda) / E(B-V) minus its value in the middle of `PEAK_BAND`, at the wavelengths of a template.
 
-    The law is that of the Milky Way, at rest-frame wavelengths in A.
+    The law is that of the Milky Way.
     """
-    if ebv == 0.0:
-        return np.ones(len(wavelength))
     middle = passbands.pivot_wavelength(passbands.load(supernova_templates.PEAK_BAND))
-    table = extinction.milky_way_table(_LAW_FIRST, _LAW_COUNT)
-    k = np.interp(wavelength, _LAW_WAVELENGTH, table)
-    k_middle = float(table[round(middle) - _LAW_FIRST])
-    return np.asarray(extinction.transmission(extinction.MILKY_WAY_R_V * (k - k_middle), ebv))
+    k, k_middle = milky_way.law(template.wavelength), milky_way.law(np.array([middle]))
+    return np.asarray(extinction.MILKY_WAY_R_V * (k - k_middle))
 
 
-def _weights_of_nodes(nodes: Float, wavelength: Float, weights: Float) -> tuple[int, Float]:
-    """Return weights of the points of a spectrum, from weights at wavelengths between which it is interpolated.
+def _nodes_around(nodes: Float, wavelength: Float) -> slice:
+    """Return the indices of increasing `nodes` in the range of increasing wavelengths, with one on each side."""
+    first, last = np.searchsorted(nodes, wavelength[[0, -1]])
+    return slice(max(int(first) - 1, 0), min(int(last) + 1, len(nodes)))
+
+
+def _weights_of_nodes(nodes: Float, band: Passband) -> tuple[slice, Float]:
+    """Return weights of the points of a spectrum, with which their sum is the band-averaged flux.
 
     Parameters
     ----------
     nodes : float array, shape (w,)
-        Wavelengths of the points, A, in equal steps.
-    wavelength : float array, shape (b,)
-        Wavelengths with weights, A. Those outside the points are left out.
-    weights : float array, shape (b,)
-        Weights.
+        Wavelengths of the points, A, in equal steps. The spectrum is linear between them, and 0 outside.
+    band : Passband
+        The passband.
 
     Returns
     -------
-    (int, float array, shape (k,))
-        Index of the first of the k points with a weight, and their weights; k is 0 if no wavelength is inside.
+    (slice, float array, shape (k,))
+        Indices of the k points around the band, and their weights for f_lambda in erg s-1 cm-2 A-1 and a flux in
+        microjansky.
     """
-    place = (wavelength - nodes[0]) / (nodes[1] - nodes[0])
-    inside = (place >= 0.0) & (place <= len(nodes) - 1)
-    if not inside.any():
-        return 0, np.zeros(0)
-    place, weights = place[inside], weights[inside]
-    row_before = np.minimum(place.astype(np.int64), len(nodes) - 2)
-    share, first = place - row_before, int(row_before[0])
-    count = int(row_before[-1]) - first + 2
-    out = np.bincount(row_before - first, weights * (1.0 - share), count)
-    return first, np.asarray(out + np.bincount(row_before - first + 1, weights * share, count), float)
+    chosen, step = _nodes_around(nodes, band.wavelength), nodes[1] - nodes[0]
+    weights, moments = _weights_and_moments(band)
+    at = nodes[chosen] - band.wavelength[0]
+    if len(at) < 2:
+        return chosen, np.zeros(len(at))
+    # Each interval between two points contains the wavelengths of the band from its first point to before its last.
+    start = np.clip(np.ceil(at), 0, len(band.wavelength)).astype(np.int64)
+    is_empty = start[1:] == start[:-1]
+    total, moment = (np.where(is_empty, 0.0, np.add.reduceat(values, start)[:-1]) for values in (weights, moments))
+    of_next = (moment - at[:-1] * total) / step
+    out = np.zeros(len(at))
+    out[:-1] = total - of_next
+    out[1:] += of_next
+    return chosen, out
+
+
+@lru_cache(maxsize=32)
+def _weights_and_moments(band: Passband) -> tuple[Float, Float]:
+    """Return the weights of a band's wavelengths, and their products with the distance to the first wavelength.
+
+    Both have an additional 0 at the end. The weights are for f_lambda in erg s-1 cm-2 A-1 and a flux in microjansky.
+    """
+    weights = passbands.weights(band) / UJY_CGS
+    return np.append(weights, 0.0), np.append(weights * (band.wavelength - band.wavelength[0]), 0.0)

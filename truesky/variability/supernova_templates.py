@@ -67,14 +67,14 @@ class Template:
     flux: Float
 
     def at_phases(self, phase: Float) -> tuple[Int, Float]:
-        """Return the row of `flux` before each phase [n], and the weight [n, 2] of this and of the next row.
+        """Return the row of `flux` before each phase [...], and the weights [..., 2] of this and of the next row.
 
         Weights are 0 outside the range of phases.
         """
         row = np.clip(np.searchsorted(self.phase, phase, side="right") - 1, 0, len(self.phase) - 2)
         share = (phase - self.phase[row]) / (self.phase[row + 1] - self.phase[row])
         shines = (share >= 0.0) & (share <= 1.0)
-        return row, np.where(shines[:, None], np.stack([1.0 - share, share], axis=1), 0.0)
+        return row, np.where(shines[..., None], np.stack([1.0 - share, share], axis=-1), 0.0)
 
 
 @lru_cache(maxsize=1)

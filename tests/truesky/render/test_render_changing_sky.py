@@ -76,7 +76,7 @@ def test_a_lensed_quasar_elsewhere_changes_no_other_nucleus(lake):
         {**place, "radius": 0.02},
         {name: read.version(lake, name) for name in ("galaxies", "active_nuclei")},
     )
-    alone = nuclei.read_nuclei(versions, task, 0.0, 1.0)
+    alone = nuclei.read_nuclei(versions, task, 0.0, (1.0, 1.0))
     away = np.hypot(*(quasars[name].to_numpy() - place[name] for name in ("ra", "dec")))
     source = quasars.slice(int(np.argmax(away)), 1)
     assert away.max() > task["radius"]
@@ -91,7 +91,7 @@ def test_a_lensed_quasar_elsewhere_changes_no_other_nucleus(lake):
         def rows_in_cells(self, *arguments):
             return pa.table(columns, names=list(nuclei.IMAGE_COLUMNS))
 
-    both = nuclei.read_nuclei({**versions, nuclei.LENSED_IMAGES: OneImage()}, task, 0.0, 1.0)
+    both = nuclei.read_nuclei({**versions, nuclei.LENSED_IMAGES: OneImage()}, task, 0.0, (1.0, 1.0))
     assert len(both.points) == len(alone.points) + 1
     assert both.points.slice(0, len(alone.points)).equals(alone.points)
     assert both.points["light_curve_key"][-1].as_py() == source["light_curve_key"][0].as_py()

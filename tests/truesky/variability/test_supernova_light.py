@@ -56,6 +56,27 @@ def test_a_flux_is_the_integral_of_the_spectrum(kind, z, age, stretch, ebv, name
     np.testing.assert_allclose(flux(supernova, name, mjd)[0], expected, rtol=1e-9, atol=1e-300)
 
 
+def random_supernovae(n, seed):
+    rng = np.random.default_rng(seed)
+    return Supernovae(
+        rng.choice(sorted(TEMPLATES), n), rng.uniform(0.0, 6.0, n), 60000.0 + rng.uniform(-300.0, 100.0, n),
+        rng.uniform(18.0, 26.0, n), rng.uniform(0.7, 1.2, n), rng.uniform(-0.3, 1.5, n), rng.uniform(1.0, 9.0, n),
+        rng.uniform(0.0, 0.5, n),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["lsst_u", "euclid_vis", "euclid_h"])
+def test_no_flux_exceeds_its_upper_limit(name):
+    band, several = passbands.load(name), random_supernovae(600, 5)
+    f_nu = supernova_light.fluxes(several, band, np.array([[60000.0]]), TEMPLATES)[:, 0]
+    limits = supernova_light.upper_limits(several, band, 60000.0, TEMPLATES)
+    assert (f_nu > 0.0).sum() > 300
+    assert (limits >= f_nu * (1.0 - 1e-12)).all()
+    # The limit is useful: for half of the supernovae in H, it is less than 0.5 mag above the flux.
+    if name == "euclid_h":
+        assert np.median(limits[f_nu > 0.0] / f_nu[f_nu > 0.0]) < 1.6
+
+
 def test_a_flux_does_not_depend_on_other_dates_and_supernovae():
     rng, n = np.random.default_rng(3), 40
     kinds = rng.choice(sorted(TEMPLATES), n)

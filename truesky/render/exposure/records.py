@@ -15,6 +15,7 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.sources.disc_structure import DiscStructure
 from truesky.render.sources.galaxy_stamps import GalaxyStamps
 from truesky.render.sources.nuclei import Nuclei
+from truesky.render.sources.point_light import OwnSpectra
 from truesky.render.sources.solar_system import Population
 from truesky.render.sources.transients import Transients
 from truesky.request.accuracy import Accuracy
@@ -55,9 +56,9 @@ class Rows:
         Supernovae around the detector; None without.
     nuclei : Nuclei, optional
         Active nuclei, varying quasars and lensed quasars around the detector; None without.
-    own_spectra : float array, shape (m, w), optional
-        f_lambda, on any scale, of the last m stars at the w wavelengths of the exposure's band. Other stars have
-        the spectra of templates. None if all have.
+    own_spectra : OwnSpectra, optional
+        Spectra of the last stars over the exposure's band. Other stars have the spectra of templates. None if all
+        have.
     neighbours : tuple of NeighbourDetector
         Other detectors on the same readout board, with their bright stars, for crosstalk.
     """
@@ -77,7 +78,7 @@ class Rows:
     bulge_fractions: Float | None = None
     transients: Transients | None = None
     nuclei: Nuclei | None = None
-    own_spectra: Float | None = None
+    own_spectra: OwnSpectra | None = None
     neighbours: tuple[NeighbourDetector, ...] = ()
 
 

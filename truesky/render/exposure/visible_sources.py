@@ -260,7 +260,7 @@ def _with_changing_points(rows: Rows, aim: Aim, mjd: float) -> Rows:
     points += [] if rows.nuclei is None else [nuclei.light_at(rows.nuclei, aim.band, mjd)]
     for light in points:
         stars, fluxes = point_light.append_points(rows.stars, rows.star_fluxes, light, aim.exposure.band)
-        spectra = light.spectra if rows.own_spectra is None else np.concatenate([rows.own_spectra, light.spectra])
+        spectra = light.spectra if rows.own_spectra is None else rows.own_spectra.followed_by(light.spectra)
         rows = replace(rows, stars=stars, star_fluxes=fluxes, own_spectra=spectra)
     return rows
 
@@ -334,12 +334,16 @@ class FluxLimits:
     spikes : float
         Flux of the faintest star whose diffraction spikes or ghosts are noticeable on the detector if it is more than
         2048 pixels away (`stamp_sizes.reach`).
+    min_point_flux : float
+        Flux below which supernovae and active nuclei on the detector are left out. Such a source has less light in all
+        pixels together than a pixel may lack (`settings.Settings.edge`).
     far_galaxy : float
         Flux of the faintest galaxy whose outskirts are noticeable on the detector if it is more than 2048 pixels away.
     """
 
     min_flux: float = np.inf
     spikes: float = np.inf
+    min_point_flux: float = np.inf
     far_galaxy: float = np.inf
 
 
@@ -370,12 +374,15 @@ def flux_limits(exposure: ExposureRow, detector: Detector, band: Passband, varia
     spikes_ = _spike_electrons(exposure, detector, band, variant.mission, noise) / electrons
     if channel.on_ground:
         spikes_ = min(spikes_, ground_ghosts.min_noticeable_electrons(scene) / electrons)
+    settings = settings_for(variant.accuracy)
+    min_point_flux = settings.edge * noise / electrons
     if channel.dispersion is not None:
-        return FluxLimits(MIN_SPECTRUM_NOISE * noise / electrons, spikes_)
+        return FluxLimits(MIN_SPECTRUM_NOISE * noise / electrons, spikes_, min_point_flux)
     margin, scale = variant.mission.value("survey.selection_margin", "arcsec"), detector.pixel_scale
     return FluxLimits(
-        stamp_sizes.min_noticeable_electrons(margin, scale, noise, settings_for(variant.accuracy)) / electrons,
+        stamp_sizes.min_noticeable_electrons(margin, scale, noise, settings) / electrons,
         spikes_,
+        min_point_flux,
         outskirts.min_noticeable_electrons(stamp_sizes.reach(scale), scale, noise) / electrons,
     )
 
@@ -595,9 +602,9 @@ def _photon_fractions(spectrum_rows: Int, rows: Rows, band: Passband) -> Float:
     star = spectrum_rows[~of_galaxy] - len(rows.galaxies)
     out[~of_galaxy] = colours.stars(rows.stars.take(star), band, rows.stellar_library)
     if rows.own_spectra is not None:
-        spectrum = star - (len(rows.stars) - len(rows.own_spectra))
-        for source, row in zip(np.flatnonzero(~of_galaxy)[spectrum >= 0], spectrum[spectrum >= 0], strict=True):
-            out[source] = colours.spectrum_fractions(band, rows.own_spectra[row])
+        spectrum = star - (len(rows.stars) - rows.own_spectra.count)
+        has_own_spectrum = np.flatnonzero(~of_galaxy)[spectrum >= 0]
+        out[has_own_spectrum] = colours.spectrum_fractions(band, rows.own_spectra.of(spectrum[spectrum >= 0]))
     return out
 
 

@@ -22,6 +22,7 @@ from truesky.fluxes.spectra.lines import line_list
 from truesky.fluxes.tables import flux_tables
 from truesky.fluxes.tables.build_tables import Setting
 from truesky.fluxes.tables.flux_tables import Grid
+from truesky.numerics import matrices
 from truesky.render.psf import sub_bands
 from truesky.render.psf.sub_bands import N_SUB_BANDS
 
@@ -126,13 +127,17 @@ def stars(rows: pa.Table, band: Passband, library: Library | None = None) -> Flo
 
 
 def spectrum_fractions(band: Passband, f_lambda: Float) -> Float:
-    """Return the fractions of the detected photons of a spectrum in the sub-bands of a band, shape (N_SUB_BANDS,).
+    """Return the fractions of the detected photons of spectra in the sub-bands of a band, shape (n, N_SUB_BANDS).
 
-    `f_lambda` has the flux per wavelength at the wavelengths of the band, in any unit.
+    `f_lambda`, shape (n, w), has the flux per wavelength at the w wavelengths of the band, in any unit.
     """
     parts = sub_bands.sub_bands(band)
-    f_nu = np.array([[passbands.ab_flux(part, band.wavelength, f_lambda) for part in parts]])
-    return np.asarray(_shares(f_nu, parts)[0])
+    edges = np.cumsum([0, *(len(part.wavelength) for part in parts)])
+    f_nu = [
+        matrices.matmul(f_lambda[:, first:last], passbands.weights(part))
+        for part, first, last in zip(parts, edges[:-1], edges[1:], strict=True)
+    ]
+    return _shares(np.stack(f_nu, axis=1), parts)
 
 
 def _flat(n: int) -> Float:

@@ -12,14 +12,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from lake_schema import sky, units
-from lake_schema.arrays import Array, Float
+from lake_schema.arrays import Array, Float, Int
 from lake_schema.ids import GENERATION_ORDER, cell_from_id
 from lake_schema.store import read
-from truesky.fluxes import passbands
 from truesky.fluxes.passbands import Passband
-from truesky.numerics import matrices
-from truesky.render.sources import catalogue_rows, selection
-from truesky.render.sources.point_light import PointLight
+from truesky.fluxes.sources import table_magnification
+from truesky.render.sources import catalogue_rows, point_light, selection
+from truesky.render.sources.point_light import OwnSpectra, PointLight
 from truesky.render.sources.transients import LENSED_IMAGES
 from truesky.variability import active_nuclei
 
@@ -31,9 +30,9 @@ QUASAR_COLUMNS = ("id", "z_obs", "mag_r01", "sed_1", "a_v")
 # Columns of the table `lensed_images` of a lensed quasar.
 IMAGE_COLUMNS = ("id", "ra", "dec", "type", "source_id", "magnification", "delay")
 QUASAR_KIND, _TYPE_1 = 2, 1
-# Faintest AB magnitude at 1450 A in the rest frame of nuclei that are drawn. Nearby ones are up to 4 mag brighter in
-# the infrared.
-_FAINTEST = 32.0
+# Faintest AB magnitude at 1450 A in the rest frame of nuclei that are drawn, and largest difference between this
+# magnitude and that in a band: nearby nuclei are 4.9 mag brighter in the K band.
+_FAINTEST, _LARGEST_EXCESS = 32.0, 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +43,8 @@ class Nuclei:
     ----------
     points : Table
         Point sources that are not in the table `galaxies`: nuclei of type 1 in galaxies, and lensed images of quasars.
-        Columns `active_nuclei.FLUX_COLUMNS`, ra, dec, `magnification` (a factor of the flux) and `delay` (days).
+        Columns `active_nuclei.FLUX_COLUMNS`, ra, dec, `magnification` (a factor of the flux), `delay` (days) and
+        `point_light.MIN_F_NU`.
     quasars : Table
         Quasars of the table `galaxies` that vary; columns `active_nuclei.FACTOR_COLUMNS` and id.
     """
@@ -58,7 +58,7 @@ class Nuclei:
 
 
 def read_nuclei(
-    versions: Mapping[str, read.Version], task: Mapping[str, Any], reach_arcsec: float, min_flux: float
+    versions: Mapping[str, read.Version], task: Mapping[str, Any], reach_arcsec: float, min_f_nu: tuple[float, float]
 ) -> Nuclei | None:
     """Read the active nuclei around a detector, and the lensed images of quasars.
 
@@ -70,8 +70,9 @@ def read_nuclei(
         Row of the table `tasks`: the detector, with the `ra`, `dec` and `radius` (deg) of a circle around it.
     reach_arcsec : float
         Distance beyond the circle, in arcsec, up to which sources are read.
-    min_flux : float
-        Infinite if no source is visible, so that none is read; other values are ignored.
+    min_f_nu : (float, float)
+        Fluxes inside and outside the circle below which point sources are left out, microjansky; infinite if no source
+        is visible.
 
     Returns
     -------
@@ -81,22 +82,20 @@ def read_nuclei(
     if ACTIVE_NUCLEI not in versions and LENSED_IMAGES not in versions:
         return None
     deflection = catalogue_rows.max_deflection(versions["galaxies"])
-    cells = selection.cells_within_reach(task, deflection, reach_arcsec) if np.isfinite(min_flux) else []
-    reach = task["radius"] + reach_arcsec / 3600.0
+    cells = selection.cells_within_reach(task, deflection, reach_arcsec) if np.isfinite(min_f_nu).any() else []
 
     def select_nearby(rows: pa.Table) -> pa.Table:
-        place = rows["ra"].to_numpy(), rows["dec"].to_numpy()
-        return rows.filter(pa.array(selection.within_radius(*place, (task["ra"], task["dec"]), reach)))
+        return point_light.select_nearby(rows, task, reach_arcsec, min_f_nu)
 
     rows = None
     if ACTIVE_NUCLEI in versions:
         rows = versions[ACTIVE_NUCLEI].rows_in_cells(cells, GENERATION_ORDER, COLUMNS)
-    points = [] if rows is None else [nuclei_in_galaxies(select_nearby(rows))]
+    points = [] if rows is None else [select_nearby(nuclei_in_galaxies(rows))]
     if LENSED_IMAGES in versions:
         images = select_nearby(versions[LENSED_IMAGES].rows_in_cells(cells, GENERATION_ORDER, IMAGE_COLUMNS))
         images = images.filter(pc.is_null(images["type"]))
         # A lensed quasar may be anywhere in the cell of its lens.
-        points.append(lensed_quasars(images, *_sources_of(images, versions)))
+        points.append(select_nearby(lensed_quasars(images, *_sources_of(images, versions))))
     quasars = pa.concat_tables(points).slice(0, 0) if rows is None else select_nearby(rows)
     is_quasar = pc.equal(quasars["kind"], QUASAR_KIND) if rows is not None else pa.array([], pa.bool_())
     return Nuclei(pa.concat_tables(points), quasars.filter(is_quasar).select([*active_nuclei.FACTOR_COLUMNS, "id"]))
@@ -195,16 +194,28 @@ def light_at(nuclei: Nuclei, band: Passband, mjd: float) -> PointLight:
     Returns
     -------
     PointLight
-        Their light, without sources that do not shine.
+        Their light, without sources that do not shine or are too faint.
     """
-    f_nu, spectra = point_fluxes(nuclei.points, band, np.full((len(nuclei.points), 1), mjd))
-    shining = np.flatnonzero(f_nu[:, 0] > 0.0)
-    ids, ra, dec = (nuclei.points[name].to_numpy()[shining] for name in ("id", "ra", "dec"))
-    return PointLight(ids, ra, dec, f_nu[shining, 0], spectra[shining])
+    points, dates = nuclei.points, np.full((len(nuclei.points), 1), mjd)
+    columns = _arrays(points)
+    largest = units.f_nu_of_mag(columns["mag_1450"] - _LARGEST_EXCESS) * table_magnification(points)
+    largest *= _flux_factors(columns, band, dates)[:, 0] * columns["magnification"]
+    candidates = pa.array(np.flatnonzero(largest >= columns[point_light.MIN_F_NU]))
+    points = points.take(candidates)
+    f_nu = point_fluxes(points, band, dates[: len(points)])[:, 0]
+    shining = (f_nu > 0.0) & (f_nu >= points[point_light.MIN_F_NU].to_numpy())
+    columns = _arrays(points.filter(pa.array(shining)))
+
+    def spectra_of(indices: Int) -> Float:
+        chosen = {name: values[indices] for name, values in columns.items()}
+        return active_nuclei.mean_spectra(chosen, int(band.wavelength[0]), int(band.wavelength[-1]))
+
+    ids, ra, dec = (columns[name] for name in ("id", "ra", "dec"))
+    return PointLight(ids, ra, dec, f_nu[shining], OwnSpectra(len(ids), spectra_of))
 
 
-def point_fluxes(points: pa.Table, band: Passband, mjd: Float) -> tuple[Float, Float]:
-    """Return the light of point sources at dates.
+def point_fluxes(points: pa.Table, band: Passband, mjd: Float) -> Float:
+    """Return the fluxes of point sources at dates.
 
     Parameters
     ----------
@@ -217,37 +228,26 @@ def point_fluxes(points: pa.Table, band: Passband, mjd: Float) -> tuple[Float, F
 
     Returns
     -------
-    (float array, shape (n, m), float array, shape (n, w))
-        f_nu in microjansky, and f_lambda at the w wavelengths of the band on any scale.
+    float array, shape (n, m)
+        f_nu in microjansky.
     """
-    mean, spectra = mean_light(points, band)
-    columns = _arrays(points)
+    return mean_fluxes(points, band)[:, None] * _flux_factors(_arrays(points), band, mjd)
+
+
+def _flux_factors(columns: Mapping[str, Array], band: Passband, mjd: Float) -> Float:
+    """Return the fluxes of point sources at dates, shape (n, m), relative to their mean fluxes."""
     # Lensed quasars of a lake without the table of nuclei are constant.
     varies = np.flatnonzero(np.isfinite(columns["m_1450"]))
     factors = np.ones(mjd.shape)
     chosen = {name: values[varies] for name, values in columns.items()}
     factors[varies] = active_nuclei.flux_factors(chosen, band, mjd[varies] - chosen["delay"][:, None])
-    return mean[:, None] * factors, spectra
+    return factors
 
 
-def mean_light(points: pa.Table, band: Passband) -> tuple[Float, Float]:
-    """Return the mean light of point sources over time.
-
-    Parameters
-    ----------
-    points : Table
-        n rows of `Nuclei.points`.
-    band : Passband
-        The passband.
-
-    Returns
-    -------
-    (float array, shape (n,), float array, shape (n, w))
-        f_nu in microjansky, and f_lambda at the w wavelengths of the band on any scale.
-    """
+def mean_fluxes(points: pa.Table, band: Passband) -> Float:
+    """Return the mean fluxes over time of n rows of `Nuclei.points`, f_nu in microjansky, shape (n,)."""
     columns = _arrays(points)
-    spectra = active_nuclei.mean_spectra(columns, int(band.wavelength[0]), int(band.wavelength[-1]))
-    return units.ujy_of_cgs(matrices.matmul(spectra, passbands.weights(band))) * columns["magnification"], spectra
+    return np.asarray(active_nuclei.mean_fluxes(columns, (band,))[:, 0] * columns["magnification"])
 
 
 def _arrays(points: pa.Table) -> dict[str, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,66 @@ import numpy as np
 import pyarrow as pa
 
 from lake_schema.arrays import Float, Int
+from truesky.render.sources import selection
+
+# Column of tables of point sources with the flux below which a source is left out, microjansky.
+MIN_F_NU = "min_f_nu"
+
+
+def select_nearby(
+    points: pa.Table, task: Mapping[str, Any], reach_arcsec: float, min_f_nu: tuple[float, float]
+) -> pa.Table:
+    """Return the point sources around a detector, with the smallest flux that matters.
+
+    Parameters
+    ----------
+    points : Table
+        Point sources with the columns ra and dec.
+    task : mapping
+        Row of the table `tasks`: the detector, with the `ra`, `dec` and `radius` (deg) of a circle around it.
+    reach_arcsec : float
+        Distance beyond the circle, in arcsec, up to which sources are returned.
+    min_f_nu : (float, float)
+        Fluxes inside and outside the circle below which sources do not matter, microjansky.
+
+    Returns
+    -------
+    Table
+        The sources, with the additional column MIN_F_NU.
+    """
+    place, middle = (points["ra"].to_numpy(), points["dec"].to_numpy()), (task["ra"], task["dec"])
+    is_inside = selection.within_radius(*place, middle, task["radius"])
+    is_near = selection.within_radius(*place, middle, task["radius"] + reach_arcsec / 3600.0)
+    return points.append_column(MIN_F_NU, pa.array(np.where(is_inside, *min_f_nu))).filter(pa.array(is_near))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OwnSpectra:
+    """Spectra of n point sources, which are computed for chosen sources only.
+
+    Attributes
+    ----------
+    count : int
+        Number n of sources.
+    of : callable
+        Function (indices of k sources, int array) -> f_lambda at the w wavelengths of the band, on any scale, float
+        array of shape (k, w).
+    """
+
+    count: int
+    of: Callable[[Int], Float]
+
+    def followed_by(self, other: OwnSpectra) -> OwnSpectra:
+        """Return the spectra of these sources and of other sources after them."""
+
+        def spectra_of(indices: Int) -> Float:
+            is_own = indices < self.count
+            first_spectra, last_spectra = self.of(indices[is_own]), other.of(indices[~is_own] - self.count)
+            out = np.empty((len(indices), first_spectra.shape[1]))
+            out[is_own], out[~is_own] = first_spectra, last_spectra
+            return out
+
+        return OwnSpectra(self.count + other.count, spectra_of)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,15 +84,15 @@ class PointLight:
         Positions, deg.
     f_nu : float array, shape (n,)
         Fluxes in the band of the exposure, microjansky.
-    spectra : float array, shape (n, w)
-        f_lambda at the w wavelengths of the band, on any scale.
+    spectra : OwnSpectra
+        Their spectra.
     """
 
     ids: Int
     ra: Float
     dec: Float
     f_nu: Float
-    spectra: Float
+    spectra: OwnSpectra
 
 
 def append_points(stars: pa.Table, fluxes: pa.Table, points: PointLight, band: str) -> tuple[pa.Table, pa.Table]:

@@ -226,7 +226,7 @@ def trailed_sources(
         astrometry.pixel_of_sky(system, *bodies.positions_after(start_hours + part * seconds / _HOUR_S))
         for part in (first, 0.5 * (first + last), last)
     )
-    photons = colours.spectrum_fractions(band, solar_irradiance(band.wavelength / 10.0, mission))
+    (photons,) = colours.spectrum_fractions(band, solar_irradiance(band.wavelength / 10.0, mission)[None])
     return Sources(
         bodies.ids,
         *middle,

@@ -15,6 +15,7 @@ from truesky.fluxes.passbands import Passband
 from truesky.fluxes.sources import GALAXY_KINDS, galaxies_from_table, stars_from_table
 from truesky.numerics import matrices
 from truesky.render.sources import colours
+from truesky.render.sources.point_light import OwnSpectra
 
 # Function (indices of k sources) -> their spectra over the passband, shape (k, wavelengths).
 Spectra = Callable[[Int], Float32]
@@ -22,7 +23,7 @@ Spectra = Callable[[Int], Float32]
 
 def spectrum_function(
     spectrum_rows: Int, galaxies: pa.Table, stars: pa.Table, band: Passband, sun: Float,
-    libraries: tuple[Library | None, Library | None] = (None, None), own_spectra: Float | None = None,
+    libraries: tuple[Library | None, Library | None] = (None, None), own_spectra: OwnSpectra | None = None,
 ) -> Spectra:  # fmt: skip
     """Return a function that computes the spectra of sources over a band.
 
@@ -40,8 +41,8 @@ def spectrum_function(
     libraries : (Library or None, Library or None)
         Libraries of spectral templates to which the rows of galaxies and stars refer; None means the library of
         truesky.
-    own_spectra : float array, shape (m, w), optional
-        f_lambda of the last m stars, on any scale, instead of their templates.
+    own_spectra : OwnSpectra, optional
+        Spectra of the last stars, instead of their templates.
 
     Returns
     -------
@@ -56,7 +57,7 @@ def spectrum_function(
     """
     count, weights = len(band.wavelength), band.response * band.wavelength
     of_galaxy, of_star = _galaxies(galaxies, band, libraries[0]), _stars(stars, band, libraries[1])
-    last_rows = len(galaxies) + len(stars) - (0 if own_spectra is None else len(own_spectra))
+    last_rows = len(galaxies) + len(stars) - (0 if own_spectra is None else own_spectra.count)
 
     def spectra_of_sources(numbers: Int) -> Float32:
         rows, out = spectrum_rows[numbers], np.empty((len(numbers), count), np.float32)
@@ -69,7 +70,7 @@ def spectrum_function(
         if own_spectra is not None:
             has_own_spectrum = rows >= last_rows
             # Scale by the largest value, because f_lambda in cgs units is close to the smallest float32.
-            spectra = own_spectra[rows[has_own_spectrum] - last_rows]
+            spectra = own_spectra.of(rows[has_own_spectrum] - last_rows)
             out[has_own_spectrum] = spectra / np.maximum(spectra.max(axis=1, keepdims=True), np.finfo(float).tiny)
         detected = matrices.matmul(out, weights)
         out *= np.divide(1.0, detected, out=np.zeros(len(numbers)), where=detected > 0.0).astype(np.float32)[:, None]

@@ -10,11 +10,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from lake_schema.arrays import Float, Int
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import read
 from truesky.fluxes.passbands import Passband
-from truesky.render.sources import selection
-from truesky.render.sources.point_light import PointLight
+from truesky.render.sources import point_light, selection
+from truesky.render.sources.point_light import OwnSpectra, PointLight
 from truesky.variability import spectral_series, supernova_light
 from truesky.variability.supernova_light import Supernovae
 from truesky.variability.supernova_templates import Template
@@ -30,14 +31,22 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transients:
-    """Supernovae around a detector: rows of the table `transients` with the columns COLUMNS, and spectra by kind."""
+    """Supernovae around a detector.
+
+    Attributes
+    ----------
+    rows : Table
+        Rows of the table `transients`, with the columns COLUMNS and `point_light.MIN_F_NU`.
+    templates : mapping of int to Template
+        Spectra by kind.
+    """
 
     rows: pa.Table
     templates: Mapping[int, Template]
 
 
 def read_transients(
-    versions: Mapping[str, read.Version], task: Mapping[str, Any], reach_arcsec: float, min_flux: float
+    versions: Mapping[str, read.Version], task: Mapping[str, Any], reach_arcsec: float, min_f_nu: tuple[float, float]
 ) -> Transients | None:
     """Read the supernovae around a detector, and the images of those behind strong lenses.
 
@@ -49,8 +58,9 @@ def read_transients(
         Row of the table `tasks`: the detector, with the `ra`, `dec` and `radius` (deg) of a circle around it.
     reach_arcsec : float
         Distance beyond the circle, in arcsec, up to which supernovae are read.
-    min_flux : float
-        Infinite if no source is visible, so that no supernova is read; other values are ignored.
+    min_f_nu : (float, float)
+        Fluxes inside and outside the circle below which supernovae are left out, microjansky; infinite if no source is
+        visible.
 
     Returns
     -------
@@ -66,16 +76,15 @@ def read_transients(
     if TRANSIENTS not in versions:
         return None
     table = versions[TRANSIENTS]
-    cells = selection.cells_within_reach(task, 0.0, reach_arcsec) if np.isfinite(min_flux) else []
+    cells = selection.cells_within_reach(task, 0.0, reach_arcsec) if np.isfinite(min_f_nu).any() else []
     rows = table.rows_in_cells(cells, GENERATION_ORDER, COLUMNS)
     if LENSED_IMAGES in versions:
         images = versions[LENSED_IMAGES].rows_in_cells(cells, GENERATION_ORDER, [*COLUMNS, "source_id"])
         images = images.filter(pc.is_valid(images["type"]))
         rows = rows.filter(pc.invert(pc.is_in(rows["id"], pc.unique(images["source_id"]))))
         rows = pa.concat_tables([rows, images.select(COLUMNS).cast(rows.schema)])
-    reach = task["radius"] + reach_arcsec / 3600.0
-    is_near = selection.within_radius(rows["ra"].to_numpy(), rows["dec"].to_numpy(), (task["ra"], task["dec"]), reach)
-    return Transients(rows.filter(pa.array(is_near)), spectral_series.templates_from_facts(table.manifest["facts"]))
+    rows = point_light.select_nearby(rows, task, reach_arcsec, min_f_nu)
+    return Transients(rows, spectral_series.templates_from_facts(table.manifest["facts"]))
 
 
 def supernovae(rows: pa.Table) -> Supernovae:
@@ -99,18 +108,22 @@ def light_at(transients: Transients, band: Passband, mjd: float) -> PointLight:
     Returns
     -------
     PointLight
-        Their light, without sources that do not shine.
+        Their light, without sources that do not shine or are too faint.
     """
-    light = supernovae(transients.rows)
-    first, last = supernova_light.first_and_last_day(light, transients.templates)
-    candidates = np.flatnonzero((first <= mjd) & (last >= mjd))
+    light, min_f_nu = supernovae(transients.rows), transients.rows[point_light.MIN_F_NU].to_numpy()
+    largest = supernova_light.upper_limits(light, band, mjd, transients.templates)
+    candidates = np.flatnonzero((largest > 0.0) & (largest >= min_f_nu))
     light = light.select(candidates)
     f_nu = supernova_light.fluxes(light, band, np.array([[mjd]]), transients.templates)[:, 0]
-    shining = np.flatnonzero(f_nu > 0.0)
+    shining = np.flatnonzero((f_nu > 0.0) & (f_nu >= min_f_nu[candidates]))
     rows = transients.rows.take(pa.array(candidates[shining]))
-    spectra = supernova_light.spectra(light.select(shining), band.wavelength, mjd, transients.templates)
+    light = light.select(shining)
+
+    def spectra_of(indices: Int) -> Float:
+        return supernova_light.spectra(light.select(indices), band.wavelength, mjd, transients.templates)
+
     ids, ra, dec = (rows[name].to_numpy() for name in ("id", "ra", "dec"))
-    return PointLight(ids, ra, dec, f_nu[shining], spectra)
+    return PointLight(ids, ra, dec, f_nu[shining], OwnSpectra(len(ids), spectra_of))
 
 
 def without(transients: Transients, left_out: pa.Array) -> Transients:

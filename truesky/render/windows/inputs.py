@@ -111,8 +111,8 @@ def read_rows(tables: SkyTables, aim: Aim, variant: Variant) -> Rows:
         stellar_library=tables.stellar_library,
         complete_margin_arcsec=margin,
         lenses=lenses,
-        transients=read_transients(versions, task, ring, limits.min_flux),
-        nuclei=read_nuclei(versions, task, ring, limits.min_flux),
+        transients=read_transients(versions, task, ring, (limits.min_point_flux, limits.min_flux)),
+        nuclei=read_nuclei(versions, task, ring, (limits.min_point_flux, limits.min_flux)),
     )
 
 

@@ -12,7 +12,7 @@ from tests.truesky.render.exposure.test_render import CASES, SIDE, field, render
 from truesky.fluxes import passbands
 from truesky.render.camera import astrometry
 from truesky.render.channels.aim import Aim
-from truesky.render.sources import transients
+from truesky.render.sources import point_light, transients
 from truesky.render.sources.solar_system import Population
 from truesky.render.sources.transients import Transients
 from truesky.variability import supernova_light, supernova_templates, variable_stars
@@ -46,7 +46,7 @@ def supernovae(channel, columns, rows, magnitude, side=SIDE, seed=3):
 
 def table(values):
     arrays = {name: pa.array(values[name]).cast(TRANSIENTS.column(name).arrow_type) for name in transients.COLUMNS}
-    return pa.table(arrays)
+    return pa.table({**arrays, point_light.MIN_F_NU: np.zeros(len(values["id"]))})
 
 
 def band(channel):

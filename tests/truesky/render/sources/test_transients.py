@@ -36,13 +36,23 @@ def rows(n=3, peak=60000.0):
 
 
 def supernovae(*arguments):
-    return Transients(rows(*arguments), supernova_templates.templates())
+    return with_limit(rows(*arguments), 0.0)
+
+
+def with_limit(table, min_f_nu):
+    """Return supernovae that are drawn above this flux (microjansky)."""
+    limits = pa.array(np.full(len(table), min_f_nu))
+    return Transients(table.append_column(point_light.MIN_F_NU, limits), supernova_templates.templates())
 
 
 def appended(sky, mjd):
     """Return stars and fluxes with the supernovae at a date, and the spectra of the supernovae."""
     light = transients.light_at(sky, BAND, mjd)
     return *point_light.append_points(STARS, FLUXES, light, BAND.name), light.spectra
+
+
+def all_of(spectra):
+    return spectra.of(np.arange(spectra.count))
 
 
 def test_those_that_shine_are_appended():
@@ -54,23 +64,25 @@ def test_those_that_shine_are_appended():
     assert stars["id"].to_pylist()[2:] == fluxes["id"].to_pylist()[2:] == sky.rows["id"].to_pylist()[:2]
     expected = supernova_light.fluxes(transients.supernovae(sky.rows), BAND, np.array([[60000.0]]), sky.templates)
     np.testing.assert_array_equal(fluxes["f_nu_lsst_r"].to_numpy()[2:], expected[:2, 0].astype(np.float32))
-    np.testing.assert_allclose(passbands.ab_flux(BAND, BAND.wavelength, own) * 1e29, expected[:2, 0])
+    np.testing.assert_allclose(passbands.ab_flux(BAND, BAND.wavelength, all_of(own)) * 1e29, expected[:2, 0])
 
 
 def test_at_other_dates_the_stars_are_alone():
     stars, fluxes, own = appended(supernovae(), 50000.0)
     assert stars.equals(STARS)
     assert fluxes.equals(FLUXES)
-    assert own.shape == (0, len(BAND.wavelength))
+    assert own.count == 0
+    assert all_of(own).shape == (0, len(BAND.wavelength))
 
 
 def test_own_spectra_replace_templates():
     """The function of spectra returns templates of stars and the spectra of supernovae, each for one photon."""
-    stars, _, own = appended(supernovae(), 60000.0)
+    stars, _, spectra_of_points = appended(supernovae(), 60000.0)
+    own = all_of(spectra_of_points)
     sun = np.ones(len(BAND.wavelength))
     galaxies = pa.table({"id": pa.array([], pa.int64())})
     numbers = np.array([-1, 0, 1, 2, 3])
-    found = spectra.spectrum_function(numbers, galaxies, stars, BAND, sun, own_spectra=own)(np.arange(5))
+    found = spectra.spectrum_function(numbers, galaxies, stars, BAND, sun, own_spectra=spectra_of_points)(np.arange(5))
     without = spectra.spectrum_function(numbers[:3], galaxies, STARS, BAND, sun)(np.arange(3))
     np.testing.assert_array_equal(found[:3], without)
     weights = BAND.response * BAND.wavelength
@@ -79,14 +91,46 @@ def test_own_spectra_replace_templates():
 
 
 def test_photons_of_a_supernova_are_those_of_its_spectrum():
-    _, _, own = appended(supernovae(), 60030.0)
-    shares = colours.spectrum_fractions(BAND, own[0])
+    own = all_of(appended(supernovae(), 60030.0)[2])
+    several = colours.spectrum_fractions(BAND, own)
+    shares = colours.spectrum_fractions(BAND, own[:1])[0]
+    np.testing.assert_array_equal(several[0], shares)
     assert shares.sum() == pytest.approx(1.0)
     photons = own[0] * BAND.response * BAND.wavelength
     middle = np.sum(photons * BAND.wavelength) / np.sum(photons)
-    red = colours.spectrum_fractions(BAND, own[0] * BAND.wavelength**8)
+    (red,) = colours.spectrum_fractions(BAND, own[:1] * BAND.wavelength**8)
     assert np.sum(red * np.arange(8)) > np.sum(shares * np.arange(8))
     assert BAND.wavelength[0] < middle < BAND.wavelength[-1]
+
+
+def test_faint_supernovae_are_left_out():
+    table = rows(3)
+    f_nu = supernova_light.fluxes(
+        transients.supernovae(table), BAND, np.array([[60000.0]]), supernova_templates.templates()
+    )[:2, 0]
+    # The second one is redder, with the same magnitude in B.
+    assert f_nu[1] > f_nu[0] > 0.0
+    for limit, expected in ((f_nu[0], [0, 1]), (f_nu[1], [1]), (1.01 * f_nu[1], [])):
+        light = transients.light_at(with_limit(table, limit), BAND, 60000.0)
+        assert light.ids.tolist() == [table["id"][i].as_py() for i in expected]
+        assert light.spectra.count == len(expected)
+
+
+def test_spectra_of_two_lists_follow_each_other():
+    parts = [point_light.OwnSpectra(n, lambda i, k=k: np.stack([i + k, i], axis=1).astype(float))
+             for n, k in ((2, 10), (3, 20), (1, 30))]  # fmt: skip
+    joined = parts[0].followed_by(parts[1]).followed_by(parts[2])
+    assert joined.count == 6
+    np.testing.assert_array_equal(joined.of(np.array([5, 0, 2, 4, 1]))[:, 0], [30, 10, 20, 22, 11])
+    assert joined.of(np.zeros(0, int)).shape == (0, 2)
+
+
+def test_sources_inside_and_outside_the_circle_have_their_own_limits():
+    task = {"ra": 10.0, "dec": 0.0, "radius": 0.5}
+    points = pa.table({"ra": [10.0, 10.6, 359.0, 11.5], "dec": [0.4, 0.0, 0.0, 0.0]})
+    near = point_light.select_nearby(points, task, 1800.0, (0.1, 5.0))
+    assert near["ra"].to_pylist() == [10.0, 10.6]
+    assert near[point_light.MIN_F_NU].to_pylist() == [0.1, 5.0]
 
 
 def test_supernovae_are_left_out_by_identifier():
