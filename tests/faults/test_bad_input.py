@@ -18,11 +18,13 @@ from lake_schema.tables.mission import LADDER
 from tests import requests
 from tests.universe import plain_plan, plain_work
 from truesky.catalogue import (
+    build_active_nuclei,
     build_gaia,
     build_galaxies,
     build_lensed_images,
     build_stars,
     build_strong_lenses,
+    build_transients,
     dust_map,
     request_checks,
 )
@@ -31,6 +33,7 @@ from truesky.commands import check, demo, report, submit
 from truesky.commands import run as whole
 from truesky.explore import __main__ as explore
 from truesky.fluxes import compute_fluxes, inputs
+from truesky.light_curve_tables import build_light_curves
 from truesky.render import archive, coverage, plan_exposures, render_exposures
 from truesky.render.products import keys
 from truesky.render.psf import from_file
@@ -44,8 +47,8 @@ MOST_SECONDS = 30.0
 JOBS = {
     module.JOB.name: module.JOB
     for module in (
-        build_galaxies, build_stars, build_strong_lenses, build_lensed_images, build_gaia, compute_fluxes,
-        plan_exposures, render_exposures,
+        build_galaxies, build_stars, build_active_nuclei, build_transients, build_strong_lenses, build_lensed_images,
+        build_gaia, compute_fluxes, plan_exposures, build_light_curves, render_exposures,
     )
 }  # fmt: skip
 

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from lake_schema import ids as identifiers
-from lake_schema import sky, units
+from lake_schema import units
 from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
@@ -20,7 +20,7 @@ from lake_schema.store import read
 from lake_schema.store.object_storage.s3 import Folder
 from truesky.fluxes.inputs import passband_from_facts
 from truesky.fluxes.passbands import Passband
-from truesky.render.sources import nuclei, transients, varying_stars
+from truesky.render.sources import nuclei, selection, transients, varying_stars
 from truesky.render.windows import inputs
 from truesky.request import sky_notation
 from truesky.variability import active_nuclei, spectral_series, supernova_light, variable_stars
@@ -113,15 +113,10 @@ class _Query:
 
         `key` is the column with the identifiers. With `spread`, rows may be in a cell next to that of the identifier.
         """
-        cells = np.unique(identifiers.cell_from_id(self.source_numbers))
-        cells = cells[(cells >= 0) & (cells < 12 << 2 * GENERATION_ORDER)]
-        if spread and len(cells):
-            radius = 1.01 * sky.cell_radius(GENERATION_ORDER)
-            centres = zip(*sky.cell_centres(GENERATION_ORDER, cells), strict=True)
-            cells = np.unique(np.concatenate([sky.cells_in_cone(*at, radius, GENERATION_ORDER) for at in centres]))
+        cells = selection.cells_of_ids(self.source_numbers, spread)
         if table not in self.versions:
             return np.zeros(0, np.int64), pa.table({name: [] for name in columns})
-        rows = self.versions[table].rows_in_cells(cells.tolist(), GENERATION_ORDER, list(columns))
+        rows = self.versions[table].rows_in_cells(cells, GENERATION_ORDER, list(columns))
         row = pc.index_in(pa.array(self.source_numbers), rows[key].combine_chunks())
         indices = np.flatnonzero(row.is_valid().to_numpy(zero_copy_only=False))
         return indices, rows.take(row.drop_null())

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from astropy.wcs import WCS
 
 from lake_schema import ids
-from lake_schema.arrays import Array, Float
+from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.store import read
 from lake_schema.tables.galaxies import GALAXIES
@@ -289,7 +289,7 @@ def bright_sources(lake: LakeSession, number: int, max_sources: int = MAX_SOURCE
         "total": image.row["sources"],
         "id": [str(value) for value in rows["id"].to_pylist()],
         **{name: np.round(rows[name].to_numpy(), 3).tolist() for name in ("x", "y", "expected", "drawn")},
-        "kind": _kind_names(rows),
+        "kind": kind_names(rows["id"].to_numpy()),
     }
 
 
@@ -297,8 +297,11 @@ def bright_sources(lake: LakeSession, number: int, max_sources: int = MAX_SOURCE
 KIND_NAMES = {int(code): name for code, name in GALAXIES.column("kind").codes} | {5: "star", 6: "moving body"}
 
 
-def _kind_names(rows: pa.Table) -> list[str]:
-    return [KIND_NAMES.get(kind, str(kind)) for kind in ids.kind_from_id(rows["id"].to_numpy()).tolist()]
+def kind_names(identifiers: Int) -> list[str]:
+    """Return the type of each source, such as "star"; "changing source" for supernovae, nuclei and lensed images."""
+    names = [KIND_NAMES.get(kind, str(kind)) for kind in ids.kind_from_id(identifiers).tolist()]
+    changes = ids.is_transient(identifiers).tolist()
+    return ["changing source" if change else name for name, change in zip(names, changes, strict=True)]
 
 
 def failed_detectors(lake: LakeSession, request_tables: RequestTables) -> list[Json]:

@@ -23,6 +23,11 @@ from truesky.page.lake_session import LakeSession, RequestTables
 from truesky.render.products.sidecar_files import spectra_file
 
 _TABLES_BY_KIND = {**{kind: ("galaxies", "galaxy_fluxes") for kind in range(5)}, 5: ("stars", "star_fluxes")}
+# Tables with supernovae, lensed images and active nuclei, the column with the identifier, and the type of the source.
+_CHANGING_TABLES = {
+    "transients": ("id", "supernova"), "lensed_images": ("id", "lensed image"),
+    "active_nuclei": ("point_id", "active nucleus"),
+}  # fmt: skip
 # Spectra are averaged to about this number of wavelengths.
 _SPECTRUM_SAMPLES = 2400
 # Width and height of a cutout, pixels.
@@ -62,16 +67,17 @@ def describe_source(lake: LakeSession, identifier_text: str) -> Json:
     """
     identifier = _parse_identifier(identifier_text)
     kind = int(ids.kind_from_id(np.array([identifier]))[0])
-    rows, request_tables = _find_source(lake, identifier, kind)
+    rows, request_tables = _find_source(lake, identifier)
+    (kind_name,) = pictures.kind_names(np.array([identifier]))
     result: Json = {
         "id": identifier_text,
-        "kind": pictures.KIND_NAMES.get(kind, str(kind)),
+        "kind": next((_CHANGING_TABLES[table][1] for table in rows if table in _CHANGING_TABLES), kind_name),
         "request": request_tables and request_tables.request,
         "tables": {table: _describe_columns(row) for table, row in rows.items()},
         "drawn": [],
         "spectra": [],
     }
-    if request_tables is not None and (row := rows.get(_TABLES_BY_KIND[kind][0])) is not None:
+    if request_tables is not None and (row := _row_with_position(rows)) is not None:
         ra, dec = (float(row[name][0].as_py()) for name in ("ra", "dec"))
         result["place"] = [ra, dec]
         result["images"] = [
@@ -151,35 +157,48 @@ def _parse_identifier(text: str) -> int:
     return int(text)
 
 
-def _source_rows(version: read.Version, identifier: int) -> pa.Table:
+def _row_with_position(rows: Mapping[str, pa.Table]) -> pa.Table | None:
+    """Return the row of a catalogue among the rows of a source by table, or None if there are only fluxes."""
+    return next((row for table, row in rows.items() if not table.endswith("fluxes")), None)
+
+
+def _id_columns(identifier: int) -> dict[str, str]:
+    """Return the tables that may contain a source, each with the column of its identifier."""
+    if ids.is_transient(np.array([identifier]))[0]:
+        return {table: column for table, (column, _) in _CHANGING_TABLES.items()}
+    kind = int(ids.kind_from_id(np.array([identifier]))[0])
+    return dict.fromkeys(_TABLES_BY_KIND.get(kind, ()), "id")
+
+
+def _source_rows(version: read.Version, identifier: int, id_column: str = "id") -> pa.Table:
     """Return the row of a source in a table, as a table of one row, or of none if the source is not in it.
 
-    The identifier contains the HEALPix cell of the source, or of its halo. Files of this cell and its neighbours are
-    read first, and all files only if the source is not found there.
+    The identifier, in the column `id_column`, contains the HEALPix cell of the source, or of its halo. Files of this
+    cell and its neighbours are read first, and all files only if the source is not found there.
     """
     cell = identifier >> ids.BLOCK_BITS & ((1 << 2 * ids.GENERATION_ORDER + 4) - 1)
     for order in (ids.GENERATION_ORDER, ids.FILE_ORDER):
         parent_cell = int(sky.parent(cell, ids.GENERATION_ORDER, order))
         # The neighbouring cells are read, too, because lensing may have moved the source into one of them.
         rows = version.rows_in_cells([parent_cell, *sky.margin_cells(order, parent_cell, order).tolist()], order)
-        rows = rows.filter(pc.equal(rows["id"], identifier))
+        rows = rows.filter(pc.equal(rows[id_column], identifier))
         if rows.num_rows:
             return rows
-    return version.rows(where=pc.field("id") == identifier)
+    return version.rows(where=pc.field(id_column) == identifier)
 
 
-def _find_source(lake: LakeSession, identifier: int, kind: int) -> tuple[dict[str, pa.Table], RequestTables | None]:
+def _find_source(lake: LakeSession, identifier: int) -> tuple[dict[str, pa.Table], RequestTables | None]:
     """Return the rows of a source by name of the table, and the request to which they belong.
 
-    `kind` is the code of the source's type. The tables are the catalogue and the fluxes. If several requests contain
-    the source, the first one with the most of these tables is used. The result is ({}, None) if no request contains it.
+    The tables are the catalogue and the fluxes, or the table of a changing source. If several requests contain the
+    source, the first one with the most of these tables is used. The result is ({}, None) if no request contains it.
     """
     best: tuple[dict[str, pa.Table], RequestTables | None] = {}, None
-    tables = _TABLES_BY_KIND.get(kind, ())
+    tables = _id_columns(identifier)
     for request_tables in lake.request_tables(*tables):
         rows = {
-            table: _source_rows(request_tables.versions[table], identifier)
-            for table in tables
+            table: _source_rows(request_tables.versions[table], identifier, id_column)
+            for table, id_column in tables.items()
             if table in request_tables.versions
         }
         rows = {table: row for table, row in rows.items() if row.num_rows}
@@ -227,9 +246,13 @@ def spectrum(lake: LakeSession, identifier_text: str) -> Json:
 def _spectrum(lake: LakeSession, identifier_text: str) -> Json:
     identifier = _parse_identifier(identifier_text)
     kind = int(ids.kind_from_id(np.array([identifier]))[0])
+    if ids.is_transient(np.array([identifier]))[0]:
+        raise BadInput(
+            f"source {identifier} changes and has no constant spectrum: truesky.open(LAKE).light_curve gives its fluxes"
+        )
     if kind not in (0, 1, 4, 5):
         raise BadInput(f"a source of kind {pictures.KIND_NAMES.get(kind, kind)} has no spectrum")
-    rows, request_tables = _find_source(lake, identifier, kind)
+    rows, request_tables = _find_source(lake, identifier)
     for name in _TABLES_BY_KIND[kind]:
         if request_tables is None or name not in rows:
             raise BadInput(f"the lake has no source {identifier} in a table {name}")

@@ -9,9 +9,11 @@ from lake_schema.store import layout, publish, read
 from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import GALAXIES
+from lake_schema.tables.variability.active_nuclei import ACTIVE_NUCLEI
+from lake_schema.tables.variability.transients import TRANSIENTS
 from tests.truesky.page.conftest import serving
 from tests.universe import rows_of
-from truesky.page import sources
+from truesky.page import pictures, sources
 
 NUMBER = 60
 
@@ -66,3 +68,30 @@ def test_the_position_comes_from_the_request_that_has_the_source(tmp_path):
             values = {fact["name"]: fact["value"] for fact in found["tables"]["galaxies"]}
             assert [values["ra"], values["dec"]] == found["place"]
             assert ids.kind_from_id(np.array([own]))[0] == values["kind"]
+
+
+def test_changing_sources_are_not_stars(tmp_path):
+    root, part = tmp_path / "lake", Task(layout.cell_file(5, 1607), {})
+    root.mkdir()
+    cell = 1607 << 6
+    numbers = np.arange(1, 3, dtype=np.uint64)
+    supernovae, nuclei = ids.transient_id(cell, numbers), ids.transient_id(cell, numbers + np.uint64(70_000))
+    tables = {}
+    for table, column, found in ((TRANSIENTS, "id", supernovae), (ACTIVE_NUCLEI, "point_id", nuclei)):
+        rows = rows_of(table, 2, seed=3)
+        rows = rows.set_column(rows.schema.get_field_index(column), rows.schema.field(column), [found.tolist()])
+        tables[table.name] = rows
+        plan = Plan(table, {"made_by": "a"}, (part,))
+        publish.make_version(root, plan, lambda lake, facts, rows=rows: Output(rows), name="a")
+    with serving(root) as page:
+        for table, kind, own in (("transients", "supernova", supernovae), ("active_nuclei", "active nucleus", nuclei)):
+            found = page.json(f"source/{own[1]}")
+            assert found["kind"] == kind
+            assert found["place"] == [tables[table][name][1].as_py() for name in ("ra", "dec")]
+            assert list(found["tables"]) == [table]
+            assert "light_curve" in page.json(f"spectrum/{own[1]}")["said"]
+        status, _, body = page.of_lake(f"source/{ids.transient_id(cell, np.array([9], np.uint64))[0]}")
+        assert status == 400
+        assert b"no source" in body
+    star = ids.source_id(5, cell, np.arange(1))
+    assert pictures.kind_names(np.concatenate([supernovae, star])) == ["changing source"] * 2 + ["star"]

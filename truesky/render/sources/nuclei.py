@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from lake_schema import sky, units
+from lake_schema import units
 from lake_schema.arrays import Array, Float, Int
-from lake_schema.ids import GENERATION_ORDER, cell_from_id
+from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import read
 from truesky.fluxes.passbands import Passband
 from truesky.fluxes.sources import table_magnification
@@ -104,17 +103,12 @@ def read_nuclei(
 def _sources_of(images: pa.Table, versions: Mapping[str, read.Version]) -> tuple[pa.Table, pa.Table | None]:
     """Return the rows of the tables `galaxies` and `active_nuclei` (None without it) of lensed quasars."""
     sources = pc.unique(images["source_id"])
-    cells = np.unique(cell_from_id(sources.to_numpy())).tolist()
-    radius = 1.01 * sky.cell_radius(GENERATION_ORDER)
-    # A quasar is stored under its observed position, which may be in a cell next to the cell of its identifier.
-    centres = [sky.cell_centre(GENERATION_ORDER, cell) for cell in cells]
-    groups = [sky.cells_in_cone(*place, radius, GENERATION_ORDER).tolist() for place in centres]
-    nearby_cells = sorted(set(chain.from_iterable(groups)))
+    cells = selection.cells_of_ids(sources.to_numpy(), is_moved=True)
     tables: list[pa.Table] = []
     for name, columns in (("galaxies", (*QUASAR_COLUMNS, "kind")), (ACTIVE_NUCLEI, COLUMNS)):
         if name not in versions:
             return tables[0], None
-        rows = versions[name].rows_in_cells(nearby_cells, GENERATION_ORDER, columns)
+        rows = versions[name].rows_in_cells(cells, GENERATION_ORDER, columns)
         tables.append(rows.filter(pc.is_in(rows["id"], sources)))
     return tables[0], tables[1]
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from lake_schema import sky
 from lake_schema.arrays import Bool, Float, Int
-from lake_schema.ids import GENERATION_ORDER
+from lake_schema.ids import GENERATION_ORDER, cell_from_id
 
 # Largest distance from a detector, in arcsec, up to which the outskirts of galaxies are drawn on it; diffraction spikes
 # of stars have the same limit.
@@ -34,6 +34,31 @@ def cells_of_task(task: Mapping[str, Any], deflection: float) -> list[int]:
     from the cell under which it is stored.
     """
     return _cells(task, deflection)
+
+
+def cells_of_ids(identifiers: Int, is_moved: bool) -> list[int]:
+    """Return the order-8 HEALPix cells under which sources may be stored.
+
+    Parameters
+    ----------
+    identifiers : int64 array, shape (n,)
+        Identifiers of the sources. Cells that do not exist are left out.
+    is_moved : bool
+        Whether a source may be stored in a cell next to that in its identifier, because its observed position differs
+        from the true one.
+
+    Returns
+    -------
+    list of int
+        Sorted nested indices of the cells.
+    """
+    cells = np.unique(cell_from_id(identifiers))
+    cells = cells[(cells >= 0) & (cells < 12 << 2 * GENERATION_ORDER)]
+    if is_moved and len(cells):
+        radius = 1.01 * sky.cell_radius(GENERATION_ORDER)
+        centres = zip(*sky.cell_centres(GENERATION_ORDER, cells), strict=True)
+        cells = np.unique(np.concatenate([sky.cells_in_cone(*at, radius, GENERATION_ORDER) for at in centres]))
+    return [int(cell) for cell in cells]
 
 
 def cells_within_reach(task: Mapping[str, Any], deflection: float, reach: float) -> list[int]:
