@@ -26,6 +26,8 @@ from truesky.render.effects.scene import Frame, Lights, Scene
 
 # Number of samples along each side of a pixel, to compute the part of the pixel that a ghost covers.
 _SUBSAMPLES = 4
+# Half of the diagonal of a pixel in pixels, with a margin for rounding.
+_HALF_DIAGONAL = 0.72
 # Stands for the detector of a scene without one, which has the axes of the focal plane.
 _WITHOUT_DETECTOR = Detector("", "", 0, 0, 0.0, 0.0, 0.0, 1.0)
 
@@ -132,6 +134,20 @@ def _pupil_image(radius: float, hole: float, arms: Any, width: float) -> Any:
     stamp = np.zeros((2 * half + 1, 2 * half + 1))
     for r in range(2 * half + 1):
         for c in range(2 * half + 1):
+            # Most pixels are far from all borders and need no samples.
+            middle = np.hypot(c - half, r - half)
+            if middle > radius + _HALF_DIAGONAL or middle < hole * radius - _HALF_DIAGONAL:
+                continue
+            is_inside = hole * radius + _HALF_DIAGONAL < middle < radius - _HALF_DIAGONAL
+            for arm in arms:
+                dx, dy, angle = c - half - arm[0], r - half - arm[1], np.radians(arm[2])
+                across = abs(dy * np.cos(angle) - dx * np.sin(angle))
+                is_inside = is_inside and (
+                    np.hypot(dx, dy) > arm[3] + _HALF_DIAGONAL or across > 0.5 * width + _HALF_DIAGONAL
+                )
+            if is_inside:
+                stamp[r, c] = 1.0
+                continue
             lit = 0
             for i in range(_SUBSAMPLES):
                 for j in range(_SUBSAMPLES):
