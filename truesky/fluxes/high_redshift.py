@@ -189,7 +189,7 @@ def spectra_at(galaxies: pa.Table, wavelength: Float) -> Float:
     galaxies : pa.Table
         Rows as for `spectra`.
     wavelength : float array, shape (w,)
-        Increasing wavelengths from 600 to 24000 A. Absorption by intergalactic hydrogen is that of bins of 1 A.
+        Increasing wavelengths in A. Absorption by intergalactic hydrogen is that in bins of 1 A.
 
     Returns
     -------
@@ -201,8 +201,10 @@ def spectra_at(galaxies: pa.Table, wavelength: Float) -> Float:
     BadInput
         If a value is missing, or frac_2 or ebv_1 is not 0. The message names the column and the source.
     OutOfRange
-        If a redshift, magnitude, extinction, template number or magnification is out of range.
+        If a redshift, magnitude, extinction, template number or magnification is out of range, or a wavelength is not
+        from 600 to 24000 A.
     """
+    check_range("wavelength", wavelength, passbands.GRID_FIRST, passbands.GRID_LAST)
     kind, z, mag, a_v = (column(galaxies, name) for name in ("kind", "z_obs", "mag_r01", "a_v"))
     sed = column(galaxies, "sed_1").astype(np.int64)
     check_range("z_obs", z, 0.0, Z_MAX)

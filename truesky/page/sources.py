@@ -195,16 +195,17 @@ def _find_source(lake: LakeSession, identifier: int) -> tuple[dict[str, pa.Table
     """
     best: tuple[dict[str, pa.Table], RequestTables | None] = {}, None
     tables = _id_columns(identifier)
+    # A changing source is in one table only.
+    largest_count = 1 if _CHANGING_TABLES.keys() & tables.keys() else len(tables)
     for request_tables in lake.request_tables(*tables):
-        rows = {
-            table: _source_rows(request_tables.versions[table], identifier, id_column)
-            for table, id_column in tables.items()
-            if table in request_tables.versions
-        }
-        rows = {table: row for table, row in rows.items() if row.num_rows}
+        rows: dict[str, pa.Table] = {}
+        for table, id_column in tables.items():
+            if table in request_tables.versions and len(rows) < largest_count:
+                row = _source_rows(request_tables.versions[table], identifier, id_column)
+                rows |= {table: row} if row.num_rows else {}
         if len(rows) > len(best[0]):
             best = rows, request_tables
-        if len(rows) == len(tables):
+        if len(rows) == largest_count:
             break
     return best
 

@@ -144,7 +144,7 @@ def mean_fluxes(nuclei: Columns, bands: Sequence[Passband]) -> Float:
     out = np.zeros((len(nuclei["type"]), len(bands)))
     # Absorption by intergalactic hydrogen is not smooth. The wavelengths of a nucleus depend on its redshift only, so
     # that its flux does not depend on other nuclei.
-    absorbed_below = intergalactic.first_transparent(nuclei["z_obs"])
+    absorbed_below = intergalactic.first_transparent(np.maximum(nuclei["z_obs"], 0.0))
     group = np.ceil(absorbed_below / _GROUP_WIDTH)
     for k, band in enumerate(bands):
         all_below = np.where(absorbed_below > band.wavelength[0], group * _GROUP_WIDTH, 0.0)

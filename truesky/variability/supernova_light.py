@@ -25,6 +25,8 @@ from truesky.variability.supernova_templates import Template
 
 # Number of wavelengths of a template in a block, and number of parts of a band, for upper limits of fluxes.
 _BLOCK, _PARTS = 8, 8
+# Number of points of light curves whose phases are computed at a time.
+_POINTS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,20 +104,29 @@ def fluxes(supernovae: Supernovae, band: Passband, mjd: Float, templates: Mappin
     points of the template.
     """
     dates = np.broadcast_to(mjd, (len(supernovae), np.shape(mjd)[-1]))
-    out = np.zeros(dates.shape)
+    out, block = np.zeros(dates.shape), max(_POINTS // max(dates.shape[1], 1), 1)
     for kind in np.unique(supernovae.kind):
         members, template = np.flatnonzero(supernovae.kind == kind), templates[int(kind)]
-        row, share = template.at_phases(_phases(supernovae.select(members), dates[members]))
-        for i, own_row, own_share in zip(members.tolist(), row, share, strict=True):
-            if not own_share.any():
-                continue
-            nodes, weights = _weights_of_nodes(template.wavelength * (1.0 + supernovae.z[i]), band)
-            weights = weights * _factors(supernovae, i, template, nodes)
-            rows = slice(int(own_row.min()), int(own_row.max()) + 2)
-            curve = matrices.matmul(np.ascontiguousarray(template.flux[rows, nodes]), weights)
-            row_before = own_row - rows.start
-            out[i] = own_share[:, 0] * curve[row_before] + own_share[:, 1] * curve[row_before + 1]
+        for group in np.split(members, range(block, members.size, block)):
+            row, share = template.at_phases(_phases(supernovae.select(group), dates[group]))
+            for i, own_row, own_share in zip(group.tolist(), row, share, strict=True):
+                if own_share.any():
+                    out[i] = _light_curve(supernovae, i, band, template, (own_row, own_share))
     return out
+
+
+def _light_curve(supernovae: Supernovae, i: int, band: Passband, template: Template, place: tuple[Int, Float]) -> Float:
+    """Return the fluxes of supernova `i` in microjansky, shape (m,).
+
+    `place` are rows of the template before m phases, and weights of this and of the next row (`Template.at_phases`).
+    """
+    row, share = place
+    nodes, weights = _weights_of_nodes(template.wavelength * (1.0 + supernovae.z[i]), band)
+    weights = weights * _factors(supernovae, i, template, nodes)
+    rows = slice(int(row.min()), int(row.max()) + 2)
+    curve = matrices.matmul(np.ascontiguousarray(template.flux[rows, nodes]), weights)
+    row_before = row - rows.start
+    return np.asarray(share[:, 0] * curve[row_before] + share[:, 1] * curve[row_before + 1])
 
 
 def upper_limits(supernovae: Supernovae, band: Passband, mjd: float, templates: Mapping[int, Template]) -> Float:
@@ -253,12 +264,12 @@ def _host_dust(template: Template) -> Float:
 
 def _nodes_around(nodes: Float, wavelength: Float) -> slice:
     """Return the indices of increasing `nodes` in the range of increasing wavelengths, with one on each side."""
-    first, last = np.searchsorted(nodes, wavelength[[0, -1]])
+    first, last = np.searchsorted(nodes, wavelength[0]), np.searchsorted(nodes, wavelength[-1], side="right")
     return slice(max(int(first) - 1, 0), min(int(last) + 1, len(nodes)))
 
 
 def _weights_of_nodes(nodes: Float, band: Passband) -> tuple[slice, Float]:
-    """Return weights of the points of a spectrum, with which their sum is the band-averaged flux.
+    """Return weights of the points of a spectrum: the sum of weights times f_lambda is the band-averaged flux.
 
     Parameters
     ----------
@@ -278,8 +289,10 @@ def _weights_of_nodes(nodes: Float, band: Passband) -> tuple[slice, Float]:
     at = nodes[chosen] - band.wavelength[0]
     if len(at) < 2:
         return chosen, np.zeros(len(at))
-    # Each interval between two points contains the wavelengths of the band from its first point to before its last.
-    start = np.clip(np.ceil(at), 0, len(band.wavelength)).astype(np.int64)
+    # Each interval between two points contains the wavelengths from its first point to before its last. Only the last
+    # interval contains both of its points.
+    start = np.append(np.ceil(at[:-1]), np.floor(at[-1]) + 1.0)
+    start = np.clip(start, 0, len(band.wavelength)).astype(np.int64)
     is_empty = start[1:] == start[:-1]
     total, moment = (np.where(is_empty, 0.0, np.add.reduceat(values, start)[:-1]) for values in (weights, moments))
     of_next = (moment - at[:-1] * total) / step

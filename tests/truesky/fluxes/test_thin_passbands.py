@@ -25,3 +25,12 @@ def test_number_of_wavelengths():
     assert len(wavelength) == 500 + -(-(n - 500) // 4)
     np.testing.assert_array_equal(wavelength[:500], band.wavelength[:500])
     np.testing.assert_array_equal(weights[:500], passbands.weights(band)[:500])
+
+
+@pytest.mark.parametrize("width", [1, 20, 999])
+def test_narrow_bands_have_all_their_wavelengths(width):
+    """In a narrow band, one emission line may have most of the light."""
+    band = passbands.Passband("narrow", np.arange(6500.0, 6500.0 + width), np.ones(width), "vacuum")
+    wavelength, weights = thin_passbands.weights(band)
+    np.testing.assert_array_equal(wavelength, band.wavelength)
+    np.testing.assert_array_equal(weights, passbands.weights(band))

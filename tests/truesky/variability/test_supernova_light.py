@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from truesky.fluxes import passbands
 from truesky.variability import supernova_light, supernova_templates
 from truesky.variability.supernova_light import Supernovae
-from truesky.variability.supernova_templates import TYPE_IA
+from truesky.variability.supernova_templates import TYPE_IA, Template
 
 TEMPLATES = supernova_templates.templates()
 REFERENCES = Path(__file__).with_name("supernova_references.csv")
@@ -61,8 +61,46 @@ def random_supernovae(n, seed):
     return Supernovae(
         rng.choice(sorted(TEMPLATES), n), rng.uniform(0.0, 6.0, n), 60000.0 + rng.uniform(-300.0, 100.0, n),
         rng.uniform(18.0, 26.0, n), rng.uniform(0.7, 1.2, n), rng.uniform(-0.3, 1.5, n), rng.uniform(1.0, 9.0, n),
-        rng.uniform(0.0, 0.5, n),
+        np.zeros(n),
     )  # fmt: skip
+
+
+@given(
+    st.integers(2, 20), st.floats(0.3, 500.0), st.floats(2000.0, 7000.0), st.integers(0, 19), st.floats(0.0, 1.0),
+    st.floats(-0.5, 0.5),
+)  # fmt: skip
+def test_no_flux_exceeds_its_upper_limit_with_any_template(count, step, first, spike, z, ebv):
+    """The spectrum has light at one point only, anywhere in a block and in the band, or outside of it."""
+    flux = np.zeros((2, count))
+    flux[:, spike % count] = 1.0
+    own = {TYPE_IA: Template(np.array([-1.0, 1.0]), first + step * np.arange(count), flux)}
+    band, supernova = passbands.load("lsst2016_r"), one(z=z, ebv=ebv)
+    f_nu = supernova_light.fluxes(supernova, band, np.array([[60000.0]]), own)[0, 0]
+    limit = supernova_light.upper_limits(supernova, band, 60000.0, own)[0]
+    assert limit >= f_nu * (1.0 - 1e-9)
+    spectrum = supernova_light.spectra(supernova, band.wavelength, 60000.0, own)
+    expected = passbands.ab_flux(band, band.wavelength, spectrum)[0] * 1e29
+    assert f_nu == pytest.approx(expected, rel=1e-9, abs=1e-12 * float(spectrum.max()) * 1e29)
+
+
+@pytest.mark.parametrize(("first", "last"), [(5900, 6000), (5901, 6000), (5900, 6001), (5950, 5950), (900, 1000)])
+def test_points_of_the_template_on_the_ends_of_the_band(first, last):
+    at = np.arange(first, last + 1.0)
+    band = passbands.Passband("top hat", at, np.ones(len(at)), "vacuum")
+    for kind in (TYPE_IA, 2):
+        supernova = one(kind, z=0.0)
+        spectrum = supernova_light.spectra(supernova, at, 60000.0, TEMPLATES)[0]
+        expected = float(np.sum(passbands.weights(band) * spectrum)) * 1e29
+        found = supernova_light.fluxes(supernova, band, np.array([[60000.0]]), TEMPLATES)[0, 0]
+        assert found == pytest.approx(expected, rel=1e-9, abs=0.0)
+
+
+def test_blocks_of_points_do_not_change_light_curves(monkeypatch):
+    several, band = random_supernovae(30, 6), passbands.load("lsst_i")
+    dates = np.linspace(59900.0, 60400.0, 50)[None]
+    expected = supernova_light.fluxes(several, band, dates, TEMPLATES)
+    monkeypatch.setattr(supernova_light, "_POINTS", 100)
+    np.testing.assert_array_equal(supernova_light.fluxes(several, band, dates, TEMPLATES), expected)
 
 
 @pytest.mark.parametrize("name", ["lsst_u", "euclid_vis", "euclid_h"])

@@ -42,7 +42,7 @@ class Rows:
         Libraries with the spectra to which the columns `sed_1` and `sed_2` of galaxies, and `sed` of stars, refer. By
         default the libraries included in the package.
     complete_margin_arcsec : float
-        Distance beyond the detector up to which the rows contain every source, arcsec.
+        Distance beyond the detector up to which the rows contain every source of the catalogues, arcsec.
     previous_exposures : tuple of PreviousExposure or PreviousSky
         Earlier exposures of this detector, whose light leaves persistence.
     discs : DiscStructure, optional

@@ -54,7 +54,8 @@ STAR_COLUMNS = ("id", "ra", "dec", "pm_ra", "pm_dec", *colours.STAR_COLUMNS)
 # for brighter sources; for this number it is 1/16 electron.
 _MAX_ELECTRONS = 1e17
 # Galaxies larger than the largest stamp are drawn in a window where they have more than 1e-3 of the noise of a pixel,
-# which is this multiple of the light that is noticeable on a detector.
+# which is this multiple of the light that is noticeable on a detector. The smallest flux of supernovae and nuclei has
+# the same factor.
 _FAINT = 0.1
 # Smallest total light with which a spectrum counts as noticeable: its electrons divided by the noise of a pixel
 # (electrons rms). If all of this light is in one emission line, its signal-to-noise ratio is 0.7.
@@ -335,8 +336,9 @@ class FluxLimits:
         Flux of the faintest star whose diffraction spikes or ghosts are noticeable on the detector if it is more than
         2048 pixels away (`stamp_sizes.reach`).
     min_point_flux : float
-        Flux below which supernovae and active nuclei on the detector are left out. Such a source has less light in all
-        pixels together than a pixel may lack (`settings.Settings.edge`).
+        Flux below which supernovae and active nuclei on and near the detector are left out. All light of such a source
+        is less than a tenth of what may be neglected in a pixel (`settings.Settings.edge`). The factor keeps the light
+        small that a stack of many exposures lacks.
     far_galaxy : float
         Flux of the faintest galaxy whose outskirts are noticeable on the detector if it is more than 2048 pixels away.
     """
@@ -348,7 +350,7 @@ class FluxLimits:
 
 
 def flux_limits(exposure: ExposureRow, detector: Detector, band: Passband, variant: Variant) -> FluxLimits:
-    """Return the fluxes above which sources outside a detector are read from the catalogue.
+    """Return the fluxes above which sources outside a detector, and supernovae on it, are read from the catalogue.
 
     Parameters
     ----------
@@ -375,7 +377,7 @@ def flux_limits(exposure: ExposureRow, detector: Detector, band: Passband, varia
     if channel.on_ground:
         spikes_ = min(spikes_, ground_ghosts.min_noticeable_electrons(scene) / electrons)
     settings = settings_for(variant.accuracy)
-    min_point_flux = settings.edge * noise / electrons
+    min_point_flux = _FAINT * settings.edge * noise / electrons
     if channel.dispersion is not None:
         return FluxLimits(MIN_SPECTRUM_NOISE * noise / electrons, spikes_, min_point_flux)
     margin, scale = variant.mission.value("survey.selection_margin", "arcsec"), detector.pixel_scale
@@ -604,7 +606,7 @@ def _photon_fractions(spectrum_rows: Int, rows: Rows, band: Passband) -> Float:
     if rows.own_spectra is not None:
         spectrum = star - (len(rows.stars) - rows.own_spectra.count)
         has_own_spectrum = np.flatnonzero(~of_galaxy)[spectrum >= 0]
-        out[has_own_spectrum] = colours.spectrum_fractions(band, rows.own_spectra.of(spectrum[spectrum >= 0]))
+        out[has_own_spectrum] = colours.spectrum_fractions(band, rows.own_spectra.compute(spectrum[spectrum >= 0]))
     return out
 
 

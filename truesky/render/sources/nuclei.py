@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,8 +30,8 @@ QUASAR_COLUMNS = ("id", "z_obs", "mag_r01", "sed_1", "a_v")
 IMAGE_COLUMNS = ("id", "ra", "dec", "type", "source_id", "magnification", "delay")
 QUASAR_KIND, _TYPE_1 = 2, 1
 # Faintest AB magnitude at 1450 A in the rest frame of nuclei that are drawn, and largest difference between this
-# magnitude and that in a band: nearby nuclei are 4.9 mag brighter in the K band.
-_FAINTEST, _LARGEST_EXCESS = 32.0, 5.0
+# magnitude and that in a band: nearby nuclei are 5.2 mag brighter at 24000 A.
+_FAINTEST, _LARGEST_EXCESS = 32.0, 5.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,21 +83,25 @@ def read_nuclei(
     deflection = catalogue_rows.max_deflection(versions["galaxies"])
     cells = selection.cells_within_reach(task, deflection, reach_arcsec) if np.isfinite(min_f_nu).any() else []
 
-    def select_nearby(rows: pa.Table) -> pa.Table:
-        return point_light.select_nearby(rows, task, reach_arcsec, min_f_nu)
+    def read_nearby(table: str, columns: Sequence[str]) -> pa.Table:
+        return point_light.select_nearby(
+            versions[table].rows_in_cells(cells, GENERATION_ORDER, columns), task, reach_arcsec
+        )
 
-    rows = None
+    parts, quasars = [], None
     if ACTIVE_NUCLEI in versions:
-        rows = versions[ACTIVE_NUCLEI].rows_in_cells(cells, GENERATION_ORDER, COLUMNS)
-    points = [] if rows is None else [select_nearby(nuclei_in_galaxies(rows))]
+        rows = read_nearby(ACTIVE_NUCLEI, COLUMNS)
+        parts.append(nuclei_in_galaxies(rows))
+        quasars = rows.filter(pc.equal(rows["kind"], QUASAR_KIND))
     if LENSED_IMAGES in versions:
-        images = select_nearby(versions[LENSED_IMAGES].rows_in_cells(cells, GENERATION_ORDER, IMAGE_COLUMNS))
+        images = read_nearby(LENSED_IMAGES, IMAGE_COLUMNS)
         images = images.filter(pc.is_null(images["type"]))
-        # A lensed quasar may be anywhere in the cell of its lens.
-        points.append(select_nearby(lensed_quasars(images, *_sources_of(images, versions))))
-    quasars = pa.concat_tables(points).slice(0, 0) if rows is None else select_nearby(rows)
-    is_quasar = pc.equal(quasars["kind"], QUASAR_KIND) if rows is not None else pa.array([], pa.bool_())
-    return Nuclei(pa.concat_tables(points), quasars.filter(is_quasar).select([*active_nuclei.FACTOR_COLUMNS, "id"]))
+        parts.append(lensed_quasars(images, *_sources_of(images, versions)))
+    points = pa.concat_tables(parts)
+    quasars = points.slice(0, 0) if quasars is None else quasars
+    return Nuclei(
+        point_light.add_flux_limits(points, task, min_f_nu), quasars.select([*active_nuclei.FACTOR_COLUMNS, "id"])
+    )
 
 
 def _sources_of(images: pa.Table, versions: Mapping[str, read.Version]) -> tuple[pa.Table, pa.Table | None]:

@@ -9,17 +9,20 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Bool, Float, Int
 from truesky.render.sources import selection
 
 # Column of tables of point sources with the flux below which a source is left out, microjansky.
 MIN_F_NU = "min_f_nu"
 
 
-def select_nearby(
-    points: pa.Table, task: Mapping[str, Any], reach_arcsec: float, min_f_nu: tuple[float, float]
-) -> pa.Table:
-    """Return the point sources around a detector, with the smallest flux that matters.
+def select_nearby(points: pa.Table, task: Mapping[str, Any], reach_arcsec: float) -> pa.Table:
+    """Return the rows (columns ra and dec) within `reach_arcsec` of the circle of a detector's task."""
+    return points.filter(pa.array(_is_in_circle(points, task, reach_arcsec)))
+
+
+def add_flux_limits(points: pa.Table, task: Mapping[str, Any], min_f_nu: tuple[float, float]) -> pa.Table:
+    """Add the column MIN_F_NU to point sources.
 
     Parameters
     ----------
@@ -27,20 +30,20 @@ def select_nearby(
         Point sources with the columns ra and dec.
     task : mapping
         Row of the table `tasks`: the detector, with the `ra`, `dec` and `radius` (deg) of a circle around it.
-    reach_arcsec : float
-        Distance beyond the circle, in arcsec, up to which sources are returned.
     min_f_nu : (float, float)
-        Fluxes inside and outside the circle below which sources do not matter, microjansky.
+        Fluxes inside and outside the circle below which sources are left out, microjansky.
 
     Returns
     -------
     Table
-        The sources, with the additional column MIN_F_NU.
+        The sources with the additional column.
     """
-    place, middle = (points["ra"].to_numpy(), points["dec"].to_numpy()), (task["ra"], task["dec"])
-    is_inside = selection.within_radius(*place, middle, task["radius"])
-    is_near = selection.within_radius(*place, middle, task["radius"] + reach_arcsec / 3600.0)
-    return points.append_column(MIN_F_NU, pa.array(np.where(is_inside, *min_f_nu))).filter(pa.array(is_near))
+    return points.append_column(MIN_F_NU, pa.array(np.where(_is_in_circle(points, task, 0.0), *min_f_nu)))
+
+
+def _is_in_circle(points: pa.Table, task: Mapping[str, Any], margin_arcsec: float) -> Bool:
+    place, radius = (points["ra"].to_numpy(), points["dec"].to_numpy()), task["radius"] + margin_arcsec / 3600.0
+    return selection.within_radius(*place, (task["ra"], task["dec"]), radius)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,22 +54,22 @@ class OwnSpectra:
     ----------
     count : int
         Number n of sources.
-    of : callable
+    compute : callable
         Function (indices of k sources, int array) -> f_lambda at the w wavelengths of the band, on any scale, float
         array of shape (k, w).
     """
 
     count: int
-    of: Callable[[Int], Float]
+    compute: Callable[[Int], Float]
 
     def followed_by(self, other: OwnSpectra) -> OwnSpectra:
         """Return the spectra of these sources and of other sources after them."""
 
         def spectra_of(indices: Int) -> Float:
             is_own = indices < self.count
-            first_spectra, last_spectra = self.of(indices[is_own]), other.of(indices[~is_own] - self.count)
+            first_spectra = self.compute(indices[is_own])
             out = np.empty((len(indices), first_spectra.shape[1]))
-            out[is_own], out[~is_own] = first_spectra, last_spectra
+            out[is_own], out[~is_own] = first_spectra, other.compute(indices[~is_own] - self.count)
             return out
 
         return OwnSpectra(self.count + other.count, spectra_of)

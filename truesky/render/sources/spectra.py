@@ -70,7 +70,7 @@ def spectrum_function(
         if own_spectra is not None:
             has_own_spectrum = rows >= last_rows
             # Scale by the largest value, because f_lambda in cgs units is close to the smallest float32.
-            spectra = own_spectra.of(rows[has_own_spectrum] - last_rows)
+            spectra = own_spectra.compute(rows[has_own_spectrum] - last_rows)
             out[has_own_spectrum] = spectra / np.maximum(spectra.max(axis=1, keepdims=True), np.finfo(float).tiny)
         detected = matrices.matmul(out, weights)
         out *= np.divide(1.0, detected, out=np.zeros(len(numbers)), where=detected > 0.0).astype(np.float32)[:, None]

@@ -83,7 +83,7 @@ def read_transients(
         images = images.filter(pc.is_valid(images["type"]))
         rows = rows.filter(pc.invert(pc.is_in(rows["id"], pc.unique(images["source_id"]))))
         rows = pa.concat_tables([rows, images.select(COLUMNS).cast(rows.schema)])
-    rows = point_light.select_nearby(rows, task, reach_arcsec, min_f_nu)
+    rows = point_light.add_flux_limits(point_light.select_nearby(rows, task, reach_arcsec), task, min_f_nu)
     return Transients(rows, spectral_series.templates_from_facts(table.manifest["facts"]))
 
 

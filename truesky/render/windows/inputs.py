@@ -77,7 +77,8 @@ def read_rows(tables: SkyTables, aim: Aim, variant: Variant) -> Rows:
     Returns
     -------
     Rows
-        All sources in the window and its surroundings, and bright sources farther away.
+        All sources in the window and its surroundings, except very faint supernovae and nuclei, and bright sources
+        farther away.
 
     Raises
     ------

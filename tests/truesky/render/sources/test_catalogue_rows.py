@@ -16,9 +16,10 @@ from tests.truesky.render.exposure.test_render import field as field_of
 from tests.truesky.render.fields import MISSION, exposure, fluxes, galaxies, psf_of, small, stars
 from truesky.fluxes import passbands
 from truesky.render.camera import astrometry, pointing
+from truesky.render.channels.aim import electron_rate
 from truesky.render.drawing import stamp_sizes, stamps
 from truesky.render.drawing.settings import settings_for
-from truesky.render.exposure import visible_sources
+from truesky.render.exposure import scene_factory, visible_sources
 from truesky.render.exposure.records import Rows, Variant
 from truesky.render.products import keys
 from truesky.render.sources import catalogue_rows, galaxy_shapes, selection
@@ -125,6 +126,16 @@ def test_sources_beyond_the_reach_or_too_faint_do_not_change_the_image():
         one = rendered(distance, flux)
         np.testing.assert_array_equal(one.science, empty.science)
         np.testing.assert_array_equal(one.noise_free, empty.noise_free)
+
+
+def test_supernovae_and_nuclei_that_are_left_out_are_a_small_part_of_the_noise():
+    exposed = field_of("EXT")[1]
+    row = exposure(**exposed)
+    limit = limits_of(exposed, DETECTOR, "lsst_r").min_point_flux
+    noise = scene_factory.from_exposure(row, DETECTOR, MISSION, SURVEY).pixel_noise
+    electrons = limit * electron_rate(row) * row.exposure_time_s
+    assert electrons == pytest.approx(0.1 * settings_for(SURVEY).edge * noise, rel=0.01)
+    assert electrons < 0.01 * noise
 
 
 def test_faint_sources_in_the_cells_of_the_circle_are_read_up_to_the_reach():

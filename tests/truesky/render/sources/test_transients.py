@@ -52,7 +52,7 @@ def appended(sky, mjd):
 
 
 def all_of(spectra):
-    return spectra.of(np.arange(spectra.count))
+    return spectra.compute(np.arange(spectra.count))
 
 
 def test_those_that_shine_are_appended():
@@ -121,14 +121,14 @@ def test_spectra_of_two_lists_follow_each_other():
              for n, k in ((2, 10), (3, 20), (1, 30))]  # fmt: skip
     joined = parts[0].followed_by(parts[1]).followed_by(parts[2])
     assert joined.count == 6
-    np.testing.assert_array_equal(joined.of(np.array([5, 0, 2, 4, 1]))[:, 0], [30, 10, 20, 22, 11])
-    assert joined.of(np.zeros(0, int)).shape == (0, 2)
+    np.testing.assert_array_equal(joined.compute(np.array([5, 0, 2, 4, 1]))[:, 0], [30, 10, 20, 22, 11])
+    assert joined.compute(np.zeros(0, int)).shape == (0, 2)
 
 
 def test_sources_inside_and_outside_the_circle_have_their_own_limits():
     task = {"ra": 10.0, "dec": 0.0, "radius": 0.5}
     points = pa.table({"ra": [10.0, 10.6, 359.0, 11.5], "dec": [0.4, 0.0, 0.0, 0.0]})
-    near = point_light.select_nearby(points, task, 1800.0, (0.1, 5.0))
+    near = point_light.add_flux_limits(point_light.select_nearby(points, task, 1800.0), task, (0.1, 5.0))
     assert near["ra"].to_pylist() == [10.0, 10.6]
     assert near[point_light.MIN_F_NU].to_pylist() == [0.1, 5.0]
 
