@@ -17,7 +17,22 @@ MIN_F_NU = "min_f_nu"
 
 
 def select_nearby(points: pa.Table, task: Mapping[str, Any], reach_arcsec: float) -> pa.Table:
-    """Return the rows (columns ra and dec) within `reach_arcsec` of the circle of a detector's task."""
+    """Return the sources around a detector.
+
+    Parameters
+    ----------
+    points : Table
+        Sources with the columns ra and dec.
+    task : mapping
+        Row of the table `tasks`: the detector, with the `ra`, `dec` and `radius` (deg) of a circle around it.
+    reach_arcsec : float
+        Distance beyond the circle, in arcsec, up to which sources are returned.
+
+    Returns
+    -------
+    Table
+        The sources in the enlarged circle.
+    """
     return points.filter(pa.array(_is_in_circle(points, task, reach_arcsec)))
 
 

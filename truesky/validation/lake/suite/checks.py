@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from truesky.validation.lake.catalogues import (
     angular_clustering,
     angular_power,
+    changing_sources,
     colours,
     cosmic_shear,
     duplicates,
@@ -93,6 +94,18 @@ CATALOGUE_CHECKS = (
     CatalogueCheck(colours.NAME, ("galaxies", "galaxy_fluxes"), colours.measure, colours.SOURCE),
     CatalogueCheck(duplicates.NAME, ("galaxies",), _without_series(duplicates.rows), duplicates.SOURCE),
     CatalogueCheck(duplicates.NAME, ("stars",), _without_series(duplicates.rows), duplicates.SOURCE),
+    CatalogueCheck(
+        changing_sources.NAME,
+        ("transients", "galaxies"),
+        _without_series(changing_sources.supernova_rows),
+        changing_sources.RATE_SOURCE,
+    ),
+    CatalogueCheck(
+        changing_sources.NAME,
+        ("active_nuclei", "galaxies"),
+        _without_series(changing_sources.nucleus_rows),
+        changing_sources.HOSTS_SOURCE,
+    ),
     CatalogueCheck(
         requirements.NAME, ("galaxies", "galaxy_fluxes"), _without_series(requirements.rows), requirements.SOURCE
     ),

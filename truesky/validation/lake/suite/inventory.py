@@ -24,7 +24,7 @@ from truesky.validation.lake.measure.rows import Place
 # Names of the tables that the checks read. If one changes, the table `validation` must be made again.
 TABLES = (
     "galaxies", "stars", "mission", "galaxy_fluxes", "star_fluxes", "exposures", "products", "rendered_truth",
-    "rendered_spectra", "depth", "randoms",
+    "rendered_spectra", "depth", "randoms", "transients", "active_nuclei",
 )  # fmt: skip
 
 

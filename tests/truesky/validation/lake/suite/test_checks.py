@@ -6,6 +6,7 @@ import pytest
 
 from tests.truesky.validation.lake.catalogues import (
     test_angular_power,
+    test_changing_sources,
     test_colours,
     test_redshift_multipoles,
     test_two_points,
@@ -57,6 +58,10 @@ FAULTS = {
     "angular_power": ((test_angular_power.test_faults_are_found, "halos of another mass; sign of convergence"),),
     "redshift_space": ((test_redshift_multipoles.test_galaxies_that_do_not_cluster_fail, "positions drawn anew"),),
     "duplicates": ((catalogues.test_a_duplicated_cell_is_found, "a duplicated cell"),),
+    "changing_sources": (
+        (test_changing_sources.test_supernovae_of_unknown_galaxies_and_repeated_ones, "unknown hosts, repeated rows"),
+        (test_changing_sources.test_ten_times_too_many_supernovae, "ten times too many"),
+        (test_changing_sources.test_nuclei_of_unknown_galaxies_and_repeated_ones, "unknown galaxies, repeated rows")),
     "observed": ((test_observed.test_a_band_whose_magnitudes_are_shifted_in_a_lake, "a band shifted by 0.3 mag"),
                  (test_observed.test_masses_rates_and_lines_that_are_off_in_a_lake, "masses, rates, lines off"),
                  (test_observed.test_a_lake_that_counts_its_area_twice, "all cells duplicated")),
