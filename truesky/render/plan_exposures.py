@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,14 +21,17 @@ from lake_schema.store.provenance import digest
 from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.mission import MISSION
 from lake_schema.tables.tasks import TASKS
+from truesky.render.channels import registry
 from truesky.render.forecasting import forecast, speed
 from truesky.render.forecasting.speed import Speed
 from truesky.render.planning import ground_surveys, psf_files, source_counts, tasks, variants
 from truesky.render.planning.detector_costs import OutputFiles
 from truesky.render.planning.exposure_chunks import Chunk, Layout
 from truesky.render.planning.mission import PLAN_SECTIONS, mission_of, user_filters
+from truesky.render.planning.planned_exposures import Exposure
 from truesky.request import universe
 from truesky.request.schema import Request
+from truesky.request.transients import Transients
 from truesky.running.submitted_job import Job, Step, common_facts
 
 # Rows of the table `exposures`, and rows of the table `tasks` (one per detector) for the same exposures.
@@ -156,7 +159,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     """
     universe.check_catalogues(_catalogues(lake, request), request)
     planner = Planner.from_request(lake, request)
-    _warn_of_dates(planner)
+    _warn_of_dates(planner, request)
     facts = {
         **common_facts(request, *PLAN_SECTIONS),
         "mission": planner.mission.fingerprint,
@@ -227,7 +230,7 @@ def forecast_images(lake: Path, request: Request, parts: Iterable[PlanRows]) -> 
     universe.check_catalogues(_catalogues(lake, request), request)
     machine = speed.estimate_speed(lake)
     lines = forecast.summarise_chunks(parts, machine.factor)
-    _warn_of_dates(Planner.from_request(lake, request))
+    _warn_of_dates(Planner.from_request(lake, request), request)
     return lines, machine
 
 
@@ -237,10 +240,30 @@ def _print_forecast(lake: Path, parts: Iterable[PlanRows]) -> None:
         print(line)
 
 
-def _warn_of_dates(planner: Planner) -> None:
-    exposures = (exposure for exposure, _ in planner.layout.representative_exposures())
-    for line in ground_surveys.date_warnings(exposures, planner.mission):
+def _warn_of_dates(planner: Planner, request: Request) -> None:
+    exposures = [exposure for exposure, _ in planner.layout.representative_exposures()]
+    for line in (
+        *ground_surveys.date_warnings(exposures, planner.mission),
+        *window_warnings(exposures, request.transients),
+    ):
         command.print_error("plan_exposures", line, 0)
+
+
+def window_warnings(exposures: Sequence[Exposure], window: Transients | None) -> Iterator[str]:
+    """Yield a line if exposures of the sky are outside the window of time in which supernovae are drawn.
+
+    `window` is None for a request without supernovae.
+    """
+    if window is None:
+        return
+    of_sky = [row for row in exposures if registry.CHANNELS[row.channel].sees_sky(row.image_type)]
+    outside = [row for row in of_sky if not window.start <= row.mjd <= window.end]
+    if outside:
+        number = f"{len(outside)} of {len(of_sky)} exposures of the sky are"
+        yield (
+            f"universe.transients: {number} outside the window MJD {window.start:g} to {window.end:g}, and lack "
+            f"supernovae; for example {outside[0].camera} on MJD {outside[0].mjd:.3f}"
+        )
 
 
 JOB = Job(

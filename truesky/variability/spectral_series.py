@@ -22,8 +22,8 @@ COLUMNS = ("phase", "wavelength", "flux")
 _KEY = "light_curves"
 # Largest number of points of a series, and largest number of wavelengths after resampling.
 _MAX_POINTS, _MAX_WAVELENGTHS = 5_000_000, 50_000
-# Largest step of wavelengths after resampling, A. Dust is computed at these wavelengths: 25 A give fluxes right within
-# 3e-5 for A(V) = 1.
+# Largest step of wavelengths after resampling, A; a larger one is divided. Dust is computed at these wavelengths: 25 A
+# give fluxes right within 3e-5 for A(V) = 1.
 _LARGEST_STEP = 25.0
 # Longest time before and after the peak, days.
 _MAX_PHASE = 2000.0
@@ -135,14 +135,15 @@ def _as_grid(path: Path, phase: Float, wavelength: Float, flux: Float) -> tuple[
 
 
 def _equal_steps(path: Path, phase: Float, wavelength: Float, flux: Float) -> tuple[Float, Float, Float]:
-    """Return a series at wavelengths in equal steps: the smallest step of the file, but at most `_LARGEST_STEP`."""
+    """Return a series at wavelengths in equal steps: the smallest step of the file, divided if it is large."""
     band = passbands.load(PEAK_BAND)
     if wavelength[0] > band.wavelength[0] or wavelength[-1] < band.wavelength[-1]:
         covered, band_range = (f"{edges[0]:g} to {edges[-1]:g} A" for edges in (wavelength, band.wavelength))
         raise BadInput(f"{path}: wavelengths {covered} do not cover {PEAK_BAND}, {band_range}")
     if not (flux.sum(axis=1) > 0.0).any():
         raise BadInput(f"{path}: flux is 0 everywhere")
-    step = min(float(np.diff(wavelength).min()), _LARGEST_STEP)
+    smallest = float(np.diff(wavelength).min())
+    step = smallest / np.ceil(smallest / _LARGEST_STEP)
     count = round((wavelength[-1] - wavelength[0]) / step) + 1
     if count > _MAX_WAVELENGTHS:
         raise BadInput(f"{path}: steps of wavelength are so small that {count} are needed, at most {_MAX_WAVELENGTHS}")

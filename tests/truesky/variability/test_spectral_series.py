@@ -36,6 +36,19 @@ def test_a_series_is_read_and_normalised(tmp_path):
     np.testing.assert_allclose(template.flux[2], lines, rtol=1e-12)
 
 
+@pytest.mark.parametrize(("step", "resampled"), [(10.0, 10.0), (30.0, 15.0), (45.0, 22.5), (100.0, 25.0)])
+def test_given_wavelengths_stay_points_of_the_series(tmp_path, step, resampled):
+    """A line in a single point has its height and its flux, whatever the step."""
+    wavelength = 2010.0 + step * np.arange(round(6000.0 / step) + 1)
+    phase, grid = (values.ravel() for values in np.meshgrid(PHASE, wavelength, indexing="ij"))
+    flux = np.exp(-0.5 * ((phase - 5.0) / 12.0) ** 2) * (1.0 + 4.0 * (grid == wavelength[50]))
+    template = spectral_series.read(written(tmp_path, {"phase": phase, "wavelength": grid, "flux": flux}))
+    np.testing.assert_allclose(np.diff(template.wavelength), resampled)
+    at_peak = template.flux[2] / template.flux[2, 0]
+    assert at_peak.max() == pytest.approx(5.0)
+    assert np.sum(at_peak - 1.0) * resampled == pytest.approx(4.0 * step)
+
+
 def test_rows_may_be_in_any_order(tmp_path):
     values, order = columns(), np.random.default_rng(2).permutation(len(columns()["phase"]))
     mixed = spectral_series.read(written(tmp_path, {name: column[order] for name, column in values.items()}))

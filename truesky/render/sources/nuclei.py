@@ -31,7 +31,7 @@ IMAGE_COLUMNS = ("id", "ra", "dec", "type", "source_id", "magnification", "delay
 QUASAR_KIND, _TYPE_1 = 2, 1
 # Faintest AB magnitude at 1450 A in the rest frame of nuclei that are drawn, and largest difference between this
 # magnitude and that in a band: nearby nuclei are 5.2 mag brighter at 24000 A.
-_FAINTEST, _LARGEST_EXCESS = 32.0, 5.3
+_FAINTEST, _LARGEST_EXCESS = 37.0, 5.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
