@@ -21,6 +21,7 @@ from truesky.render.camera.traces import Trace
 from truesky.render.dispersing import images, kernels, large_galaxies, separable, spreading
 from truesky.render.dispersing.images import Planes, Sampling
 from truesky.render.dispersing.stamp_sizes import LARGE_GALAXY_SIZES, LARGEST, Sizes
+from truesky.render.dispersing.wavelength_bins import Bins
 from truesky.render.drawing import stamps, transfer
 from truesky.render.drawing.kernels.frame import FIXED_POINT
 from truesky.render.psf.model import Psf
@@ -384,18 +385,18 @@ class _OrderPlan:
     tile : int
         Number of pixels along a straight trace that are drawn with the same PSF; 0 if traces of this order are never
         drawn as straight.
-    share : float array, shape (w, b)
-        Weights that interpolate the PSF at each of the spectrum's w wavelengths from the PSFs at b wavelengths.
     t : (float, float)
         Parameter t of the trace's polynomials at the first wavelength of the spectrum, and step of t from one
         wavelength to the next. t is 0 and 1 at the wavelengths `order.trace.first` and `order.trace.last`.
+    bins : Bins
+        Bins of wavelength in which the light of a spectrum is summed before it is drawn, with the PSF in them.
     """
 
     order: Order
     angstrom_per_pixel: float
     tile: int
-    share: Float
     t: tuple[float, float]
+    bins: Bins
 
     @classmethod
     def from_order(cls, order: Order, psf: Psf, settings: Settings, slope: float) -> _OrderPlan:
@@ -408,7 +409,9 @@ class _OrderPlan:
             tile = spreading.STEP * max(round(settings.block / angstrom_per_pixel / spreading.STEP), 1)
         step = 1.0 / (order.trace.last - order.trace.first)
         t = (order.first - order.trace.first) * step, step
-        return cls(order, angstrom_per_pixel, tile, images.shares(order.wavelength, psf.planes.wavelength), t)
+        share = images.shares(order.wavelength, psf.planes.wavelength)
+        bins = Bins.from_trace(along, order.trace.last - order.trace.first, order.response, share)
+        return cls(order, angstrom_per_pixel, tile, t, bins)
 
 
 @dataclass(frozen=True, slots=True)
@@ -454,7 +457,7 @@ class _OrderBatch:
         sizes, along, across, slope = source_images.sizes_on_frame(batch, plan, (peak, expected), shape)
         limit = source_images.sizes.limit * source_images.settings.separable / source_images.settings.edge
         is_separable = (peak < limit) & (sizes > 0) & (sizes <= LARGEST) & (slope <= _SEPARABLE_SLOPE)
-        is_separable &= source_images.unextended[batch] & (plan.angstrom_per_pixel >= separable.BIN)
+        is_separable &= source_images.unextended[batch]
         tiles = np.where(slope <= _STRAIGHT, plan.tile, 0)
         return cls(along, across, sizes, tiles, expected, peak, is_separable)
 
@@ -598,16 +601,16 @@ def _add_orders(
                 i = int(batch[k])
                 smooth_image = None if smooth is None else source_images.images(batch[k : k + 1], smooth)[0]
                 for m in np.flatnonzero(sizes[:, k] == size).tolist():
-                    plan, part = orders[m]
-                    light = spectra[k], float(source_images.sources.electrons[i]), plan.order.response
-                    path, place = (part.along[k], part.across[k]), source_images.places[i]
+                    (plan, part), place = orders[m], source_images.places[i]
+                    electrons = plan.bins.electrons(spectra[k], float(source_images.sources.electrons[i]))
+                    path = part.along[k], part.across[k]
                     fallen = spreading.spread(
-                        image, *light, plan.share, *path, plan.t, place, *sampling.rows, sampling.shape,
-                        int(part.tiles[k]), FIXED_POINT, order_frames[m],
+                        image, electrons, plan.bins.share, plan.bins.wave_share, *path, plan.t, plan.bins.width, place,
+                        *sampling.rows, sampling.shape, int(part.tiles[k]), FIXED_POINT, order_frames[m],
                     )  # fmt: skip
                     if smooth is not None and smooth_image is not None:
                         fallen += large_galaxies.add(
-                            smooth_image, light, plan.share, path, plan.t, place, smooth, order_frames[m]
+                            smooth_image, electrons, plan.bins, path, plan.t, place, smooth, order_frames[m]
                         )
                     tally.electrons[i, m] = fallen
 
@@ -628,8 +631,9 @@ def _add_products(
             i = int(batch[k])
             for m in np.flatnonzero(sizes[:, k] == size).tolist():
                 plan, part = orders[m]
+                electrons = plan.bins.electrons(spectra[k], float(source_images.sources.electrons[i]))
                 tally.electrons[i, m] = separable.draw_product(
-                    along_profile, across_profile, spectra[k], float(source_images.sources.electrons[i]),
-                    plan.order.response, plan.share, part.along[k], part.across[k], plan.t, source_images.places[i],
-                    sampling.shear, sampling.shape, FIXED_POINT, order_frames[m],
+                    along_profile, across_profile, electrons, plan.bins.wave_share, part.along[k], part.across[k],
+                    plan.t, plan.bins.width, source_images.places[i], sampling.shear, sampling.shape, FIXED_POINT,
+                    order_frames[m],
                 )  # fmt: skip

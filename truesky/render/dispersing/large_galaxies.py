@@ -16,6 +16,7 @@ from lake_schema.arrays import Float, Float32, Int
 from truesky.render.dispersing import spreading
 from truesky.render.dispersing.images import Sampling
 from truesky.render.dispersing.stamp_sizes import COARSE, LARGE_GALAXY_SIZES, LARGEST
+from truesky.render.dispersing.wavelength_bins import Bins
 from truesky.render.drawing.kernels.frame import FIXED_POINT
 
 # Rms of the Gaussian filter that divides the image of a large galaxy into a smooth part and the sharp rest, detector
@@ -59,8 +60,8 @@ def stamp_sampling(size: int, template: Sampling, smooth: bool = False) -> Sampl
 
 
 def add(
-    image: Float32, electrons: tuple[Float32, float, Float], share: Float, polynomials: tuple[Float, Float],
-    times: tuple[float, float], place: tuple[float, float], stamp_sampling: Sampling, frame: Int,
+    image: Float32, electrons: Float, bins: Bins, polynomials: tuple[Float, Float], times: tuple[float, float],
+    place: tuple[float, float], stamp_sampling: Sampling, frame: Int,
 ) -> float:  # fmt: skip
     """Add the smooth part of one spectral order of a large galaxy to the image of a detector.
 
@@ -68,10 +69,10 @@ def add(
     ----------
     image : float32 array, shape (b, n along, n across)
         Spline coefficients of the image of the smooth part (for one electron), blurred by the PSF at b wavelengths.
-    electrons : (float32 array, float, float array)
-        Spectrum of the galaxy [w], factor by which it is multiplied, and electrons [w] per unit of the product.
-    share : float array, shape (w, b)
-        Weights that interpolate the PSF at each of the spectrum's w wavelengths from the PSFs at b wavelengths.
+    electrons : float array, shape (bins,)
+        Electrons of the galaxy's spectrum in each of the `bins`.
+    bins : Bins
+        Bins of wavelength of the spectral order.
     polynomials : (float array, float array)
         Coefficients of t^i (i from 0) of the displacement from the undispersed image, in columns and in rows, detector
         pixels. The parameter t is linear in wavelength.
@@ -95,16 +96,15 @@ def add(
     coarse = np.zeros((rows, columns), np.int64)
     along, across = (part / COARSE for part in polynomials)
     start = place[0] / COARSE + 1.0, place[1] / COARSE + 1.0
-    spectrum, factor, response = electrons
     spreading.spread(
         image,
-        spectrum,
-        factor,
-        response,
-        share,
+        electrons,
+        bins.share,
+        bins.wave_share,
         along,
         across,
         times,
+        bins.width,
         start,
         *stamp_sampling.rows,
         stamp_sampling.shape,

@@ -17,11 +17,9 @@ from truesky.numerics.compiling import jit
 from truesky.render.dispersing import images, kernels
 from truesky.render.dispersing.images import Planes, Profiles
 from truesky.render.dispersing.kernels import add_to_trace
-from truesky.render.dispersing.spreading import add_line, add_piece
+from truesky.render.dispersing.spreading import add_piece
+from truesky.render.dispersing.wavelength_bins import BINS_BEFORE
 
-# Width of the bins in which the light of a spectrum is summed, in wavelengths; at most a pixel (see `draw._OrderPlan`).
-# The light of a wavelength is divided between the two nearest bins, which conserves its mean position.
-BIN = 4
 # Number of samples along the trace that are drawn with the same PSF.
 _SAMPLES = 16
 
@@ -81,9 +79,9 @@ def _line_transforms(
 
 @jit
 def draw_product(
-    along_profile: Float32, across_profile: Float32, spectrum: Float32, factor: float, response: Float, share: Float,
-    along: Float, across: Float, times: tuple[float, float], start: tuple[float, float], shear: float,
-    shape: tuple[int, int, int], unit: float, frame: Int,
+    along_profile: Float32, across_profile: Float32, electrons: Float, share: Float, along: Float, across: Float,
+    times: tuple[float, float], width: int, start: tuple[float, float], shear: float, shape: tuple[int, int, int],
+    unit: float, frame: Int,
 ) -> float:  # fmt: skip
     """Draw one spectral order of a source on the image of a detector (frame), as a product of two profiles.
 
@@ -93,18 +91,16 @@ def draw_product(
         Profile of the source along the trace at b wavelengths, from `profiles_of_images`.
     across_profile : float32 array, shape (b, n s_c)
         Profile of the source across the trace.
-    spectrum : float32 array, shape (w,)
-        Spectrum of the source.
-    factor : float
-        Factor by which the spectrum is multiplied.
-    response : float array, shape (w,)
-        Electrons per unit of `spectrum` times `factor`, by wavelength.
+    electrons : float array, shape (bins,)
+        Electrons of the source's spectrum in bins of wavelength, from `wavelength_bins.bin_electrons`.
     share : float array, shape (w, b)
         Weights that interpolate the PSF at each of the spectrum's w wavelengths from the PSFs at b wavelengths.
     along, across : float array, shape (i,)
         Coefficients of t^i of the displacement from the undispersed image in columns (`along`) and in rows, pixels.
     times : (float, float)
         Value of t at the first wavelength, and step of t from one wavelength to the next.
+    width : int
+        Number of wavelengths in a bin.
     start : (float, float)
         Column and row of the undispersed image, 0-based pixels.
     shear : float
@@ -123,65 +119,98 @@ def draw_product(
 
     Notes
     -----
-    In each column, the profile across the trace is placed at the mean row, and has the PSF of the mean wavelength, of
-    the light in this column.
+    In each column, the profile across the trace is placed at the mean row of the light in this column. A few
+    neighbouring columns have the same PSF, for the mean wavelength of their light.
     """
     n, ox, oy = shape
     ny, nx = frame.shape
-    count = len(response)
-    bins = (count - 1) // BIN + 2
-    electrons = np.zeros(bins)
-    for k in range(bins - 1):
-        low, high = 0.0, 0.0
-        for i in range(min(BIN, count - k * BIN)):
-            light = factor * np.float64(spectrum[k * BIN + i]) * response[k * BIN + i]
-            high += light * i
-            low += light
-        electrons[k + 1] += high / BIN
-        electrons[k] += low - high / BIN
+    count, bins = len(share), len(electrons)
+    bin_times = times[0] - BINS_BEFORE * width * times[1], width * times[1]
     # Weights with which the light, its row relative to the sheared coordinates and its wavelength are summed.
     moments = np.ones((3, bins))
     x_min, x_max, bottom, top = np.inf, -np.inf, np.inf, -np.inf
     for k in range(bins):
-        t = times[0] + times[1] * BIN * k
+        t = bin_times[0] + bin_times[1] * k
         x, y = along[len(along) - 1], across[len(across) - 1]
         for j in range(len(along) - 2, -1, -1):
             x = x * t + along[j]
         for j in range(len(across) - 2, -1, -1):
             y = y * t + across[j]
         x_min, x_max = min(x_min, start[0] + x), max(x_max, start[0] + x)
-        moments[1, k], moments[2, k] = start[1] + y - shear * (start[0] + x), BIN * k
+        moments[1, k], moments[2, k] = start[1] + y - shear * (start[0] + x), width * (k - BINS_BEFORE)
         bottom, top = min(bottom, moments[1, k]), max(top, moments[1, k])
     first = int(np.floor(ox * x_min)) - 3
     trace = np.zeros((3, int(np.ceil(ox * x_max)) + 4 - first))
-    add_to_trace(electrons, along, (times[0], times[1] * BIN), start[0], ox, moments, first, trace)
+    add_to_trace(electrons, along, bin_times, start[0], ox, moments, first, trace)
     begin = max(int(np.floor(x_min)) - n // 2 - 2, 0)
-    width = min(int(np.ceil(x_max)) + n // 2 + 3, nx) - begin
-    if width <= 0:
+    wide = min(int(np.ceil(x_max)) + n // 2 + 3, nx) - begin
+    if wide <= 0:
         return 0.0
-    ends = shear * begin, shear * (begin + width - 1)
+    ends = shear * begin, shear * (begin + wide - 1)
     low_row = max(int(np.floor(bottom + min(ends[0], ends[1]))) - n // 2 - 1, 0)
     height = min(int(np.ceil(top + max(ends[0], ends[1]))) + n // 2 + 2, ny) - low_row
     if height <= 0:
         return 0.0
-    columns = np.zeros((3, width))
+    columns = np.zeros((3, wide))
     _sum_columns(along_profile, trace, first, share, ox, begin, columns)
-    piece = np.zeros((height, width), np.float32)
-    line = np.empty(n * oy, np.float32)
-    wrapped, fine = np.empty(n * oy + oy + 4, np.float32), np.empty(n * oy, np.float32)
-    for c in range(width):
-        light = columns[0, c]
+    piece = np.zeros((height, wide), np.float32)
+    profiles, wrapped = np.empty((oy + 3, n), np.float32), np.empty(n * oy + oy + 4, np.float32)
+    for group in range(0, wide, _SAMPLES // ox):
+        part = columns[:, group : group + _SAMPLES // ox]
+        light, number = np.sum(part[0]), np.sum(part[2])
         if light == 0.0:
             continue
-        row = min(max(columns[1, c] / light, bottom), top) + shear * (begin + c)
-        number = int(min(max(columns[2, c] / light, 0.0), count - 1.0))
-        line[:] = np.float32(0.0)
-        for b in range(len(across_profile)):
-            weight, profile = np.float32(light * share[number, b]), across_profile[b]
-            for v in range(len(line)):
-                line[v] += weight * profile[v]
-        add_line(line, row, n, oy, low_row, wrapped, fine, piece[:, c])
+        number = int(min(max(number / light, 0.0), count - 1.0))
+        _mix_rows(across_profile, share[number], oy, wrapped, profiles)
+        for c in range(group, min(group + _SAMPLES // ox, wide)):
+            if columns[0, c] != 0.0:
+                row = min(max(columns[1, c] / columns[0, c], bottom), top) + shear * (begin + c)
+                _add_column(profiles, columns[0, c], row, low_row, piece[:, c])
     return add_piece(piece, (begin, low_row), unit, frame)
+
+
+@jit
+def _mix_rows(across_profile: Float32, share: Float, oy: int, wrapped: Float32, profiles: Float32) -> None:
+    """Fill `profiles` [oy + 3, n] with the profile across the trace, sorted so that `_add_column` reads it in order.
+
+    `across_profile` [b, n oy] are the coefficients of a spline at b wavelengths, which are added with the weights
+    `share` [b]. There are `oy` coefficients per row of the detector. Row k of `profiles` contains every `oy`-th of them
+    from coefficient k - 1 on. The profile is periodic: coefficients before the first and after the last are those at
+    the other end. `wrapped` [n oy + oy + 4] is scratch memory.
+    """
+    tall = across_profile.shape[1]
+    line = wrapped[1 : tall + 1]
+    line[:] = np.float32(0.0)
+    for b in range(len(across_profile)):
+        weight, profile = np.float32(share[b]), across_profile[b]
+        for v in range(tall):
+            line[v] += weight * profile[v]
+    wrapped[0] = line[tall - 1]
+    wrapped[tall + 1 :] = line[: len(wrapped) - tall - 1]
+    for k in range(len(profiles)):
+        for r in range(profiles.shape[1]):
+            profiles[k, r] = wrapped[k + r * oy]
+
+
+@jit
+def _add_column(profiles: Float32, light: float, row: float, low: int, out: Float32) -> None:
+    """Add the light of one column to the pixels `out` [h] of this column, which begin at the row `low`.
+
+    `profiles` [oy + 3, n] is the profile of n rows across the trace, from `_mix_rows`. Its middle is placed at the
+    fractional row `row` of the detector.
+    """
+    oy, n = len(profiles) - 3, profiles.shape[1]
+    begin = int(np.ceil(row - n // 2))
+    v = oy * (begin - row + n // 2)
+    first = min(int(np.floor(v)), oy - 1)
+    t = v - first
+    s = 1.0 - t
+    w0, w3 = np.float32(light * (s * s * s / 6.0)), np.float32(light * (t * t * t / 6.0))
+    w1 = np.float32(light * ((4.0 + t * t * (3.0 * t - 6.0)) / 6.0))
+    w2 = np.float32(light * ((4.0 + s * s * (3.0 * s - 6.0)) / 6.0))
+    a0, a1, a2, a3 = profiles[first], profiles[first + 1], profiles[first + 2], profiles[first + 3]
+    for r in range(max(0, low - begin), min(n, low + len(out) - begin)):
+        out[begin + r - low] += w0 * a0[r] + w1 * a1[r] + w2 * a2[r] + w3 * a3[r]
 
 
 @jit

@@ -14,6 +14,7 @@ import numpy as np
 from lake_schema.arrays import Float, Float32, Int
 from truesky.numerics.compiling import jit
 from truesky.render.dispersing.kernels import add_to_trace
+from truesky.render.dispersing.wavelength_bins import BINS_BEFORE
 
 # Number of positions along a trace (nodes) at which its column, row and wavelength are computed. They are interpolated
 # linearly between the nodes.
@@ -490,9 +491,9 @@ def add_refined(coarse: Int, step: int, frame: Int) -> int:
 
 @jit
 def spread(
-    images: Float32, spectrum: Float32, factor: float, response: Float, share: Float, along: Float, across: Float,
-    times: tuple[float, float], start: tuple[float, float], slope: float, shear: float, shape: tuple[int, int, int],
-    tile: int, unit: float, frame: Int,
+    images: Float32, electrons: Float, bin_share: Float, share: Float, along: Float, across: Float,
+    times: tuple[float, float], width: int, start: tuple[float, float], slope: float, shear: float,
+    shape: tuple[int, int, int], tile: int, unit: float, frame: Int,
 ) -> float:  # fmt: skip
     """Draw one spectral order of a source on the image of a detector (frame).
 
@@ -502,12 +503,10 @@ def spread(
         Spline coefficients of the source's image (for one electron), blurred by the PSF at b wavelengths, from
         `images.coefficients`. If `tile` is positive, they must be in sheared coordinates, in which the trace is nearly
         a row.
-    spectrum : float32 array, shape (w,)
-        Spectrum of the source.
-    factor : float
-        Factor by which the spectrum is multiplied.
-    response : float array, shape (w,)
-        Electrons per unit of `spectrum` times `factor`, by wavelength.
+    electrons : float array, shape (bins,)
+        Electrons of the source's spectrum in bins of wavelength, from `wavelength_bins.bin_electrons`.
+    bin_share : float array, shape (b, bins)
+        Weights that interpolate the PSF in each bin from the PSFs at b wavelengths.
     share : float array, shape (w, b)
         Weights that interpolate the PSF at each of the spectrum's w wavelengths from the PSFs at b wavelengths.
     along, across : float array, shape (i,)
@@ -515,6 +514,8 @@ def spread(
         (`across`), pixels. The parameter t is linear in wavelength.
     times : (float, float)
         Value of t at the first wavelength, and step of t from one wavelength to the next.
+    width : int
+        Number of wavelengths in a bin.
     start : (float, float)
         Column and row of the undispersed image, 0-based pixels.
     slope : float
@@ -540,31 +541,30 @@ def spread(
     """
     n, ox, oy = shape
     ny, nx = frame.shape
-    electrons = np.empty(len(response))
-    for i in range(len(response)):
-        electrons[i] = factor * np.float64(spectrum[i]) * response[i]
-    path = _path(along, across, times, len(response), start)
+    path = _path(along, across, times, len(share), start)
     x_first, x_last = path[0, 0], path[0, _NODES - 1]
     bottom, top = np.min(path[1]), np.max(path[1])
-    first = int(np.floor(ox * x_first)) - 3
-    trace_electrons = np.zeros((1 if tile > 0 else share.shape[1], int(np.ceil(ox * x_last)) + 4 - first))
+    # Bins before the first and after the last wavelength extend the trace by at most a pixel at each end.
+    first = int(np.floor(ox * x_first)) - 3 - ox
+    trace_electrons = np.zeros((1 if tile > 0 else share.shape[1], int(np.ceil(ox * x_last)) + 4 + ox - first))
     # For a straight trace, `convolve_trace` applies the interpolation weights of the PSFs later. So the electrons are
     # distributed along the trace as if there were only one PSF.
-    wave_share = np.ones((1, len(response))) if tile > 0 else np.ascontiguousarray(share.T)
-    add_to_trace(electrons, along, times, start[0], ox, wave_share, first, trace_electrons)
+    wave_share = np.ones((1, len(electrons))) if tile > 0 else bin_share
+    bin_times = times[0] - BINS_BEFORE * width * times[1], width * times[1]
+    add_to_trace(electrons, along, bin_times, start[0], ox, wave_share, first, trace_electrons)
     steepest = max(np.abs(_slope(path, 0)), np.abs(_slope(path, _NODES - 2)))
     wing = (steepest if tile > 0 else abs(shear)) * (n // 2 + 2.0)
     begin = max(int(np.floor(x_first)) - n // 2 - 2, 0), max(int(np.floor(bottom - wing)) - n // 2 - 1, 0)
-    width = min(int(np.ceil(x_last)) + n // 2 + 3, nx) - begin[0]
+    columns = min(int(np.ceil(x_last)) + n // 2 + 3, nx) - begin[0]
     height = min(int(np.ceil(top + wing)) + n // 2 + 2, ny) - begin[1]
-    if width <= 0 or height <= 0:
+    if columns <= 0 or height <= 0:
         return 0.0
-    piece = np.zeros((height, width), np.float32)
+    piece = np.zeros((height, columns), np.float32)
     if tile == 0:
         add_samples(images, trace_electrons, first, path, slope, shear, shape, begin, piece)
     else:
         low = begin[0] - n - 2 * tile
-        lines = np.zeros((width + 2 * n + 4 * tile + 2 * STEP, n * oy), np.float32)
+        lines = np.zeros((columns + 2 * n + 4 * tile + 2 * STEP, n * oy), np.float32)
         convolve_trace(images, trace_electrons[0], first, path, shear, share, shape, tile, low, lines)
         add_lines(lines, low, path, shape, begin, piece)
     return add_piece(piece, begin, unit, frame)

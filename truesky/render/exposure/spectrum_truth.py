@@ -298,23 +298,23 @@ def emission_line_columns(light: Light, source: Int, paths: TracePaths, aim: Aim
     continuum = paths.level[at] / np.maximum(2.0 * paths.half[at], 1.0)
     noise = _image_area(light, source[at]) * (scene.pixel_noise**2 + continuum)
     snr = electrons / np.sqrt(noise[:, None] + np.maximum(electrons, 1e-30))
-    for i, line_wavelength, line_electrons, line_snr in zip(at.tolist(), wavelength, electrons, snr, strict=True):
-        is_visible = (line_electrons > 0.0) & _is_on_detector(
-            first, (paths.along[i], paths.across[i]), line_wavelength, aim
-        )
-        for name, values in zip(names, (line_wavelength, line_electrons, line_snr), strict=True):
-            columns[name][i] = values[is_visible]
+    is_visible = (electrons > 0.0) & _is_on_detector(first, paths, at, wavelength, aim)
+    for name, values in zip(names, (wavelength, electrons, snr), strict=True):
+        for i, trace_values, selected in zip(at.tolist(), values, is_visible, strict=True):
+            columns[name][i] = trace_values[selected]
     return columns
 
 
-def _is_on_detector(trace: Trace, path: tuple[Float, Float], wavelength: Float, aim: Aim) -> Bool:
-    """Return the mask of the wavelengths [n], Angstrom, whose light on a trace falls onto a pixel of the detector.
+def _is_on_detector(trace: Trace, paths: TracePaths, at: Int, wavelength: Float, aim: Aim) -> Bool:
+    """Return the mask [k, n] of the wavelengths [k, n] whose light on k traces falls onto a pixel of the detector.
 
-    `path` contains the polynomial coefficients of column and row, pixels, in the variable t. It increases linearly from
-    0 at the wavelength `trace.first` to 1 at the wavelength `trace.last`. `aim` is the exposure and the detector.
+    `at` [k] are the indices of the traces in `paths`. Their polynomials have the variable t, which increases linearly
+    from 0 at the wavelength `trace.first` to 1 at the wavelength `trace.last`, Angstrom. `aim` is the exposure and the
+    detector.
     """
     t = (wavelength - trace.first) / (trace.last - trace.first)
-    column, row = (np.polynomial.polynomial.polyval(t, part) for part in path)
+    polynomials = (_stack_coefficients([part[i] for i in at.tolist()]).T for part in (paths.along, paths.across))
+    column, row = (np.polynomial.polynomial.polyval(t, part[:, :, None], tensor=False) for part in polynomials)
     in_columns = (column > -0.5) & (column < aim.detector.nx - 0.5)
     return np.asarray(in_columns & (row > -0.5) & (row < aim.detector.ny - 0.5))
 

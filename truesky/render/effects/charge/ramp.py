@@ -399,7 +399,7 @@ def _draw_ramps(
     groups, reads, drops = shape
     full_well, linear_below = limits
     frames = groups * reads + (groups - 1) * drops
-    e, group = np.empty(groups + 1), np.empty(groups)
+    group = np.empty(groups)
     size = len(light)
     # Mean of k^2 over the reads of each group, where k is the number of frames since the reset. For f electrons per
     # frame, the nonlinearity N (1 - b N) reduces a group by b f^2 times this mean.
@@ -408,66 +408,110 @@ def _draw_ramps(
         squares[i] = 0.0
         for j in range(reads):
             squares[i] += float(i * (reads + drops) + j + 1) ** 2 / reads
-    for p in range(size):
-        f = max(light[p], 0.0) / ((groups - 1) * (reads + drops))
-        hit = hit_charge[p] if len(hit_charge) > 0 else 0.0
-        b = coefficient[p] if len(coefficient) > 0 else 0.0
-        end = f * frames
-        if hit != 0.0 or end > linear_below or end + 10.0 * math.sqrt(end) > full_well:
-            hit_frame = int(hit_time[p] * frames) if len(hit_charge) > 0 else 0
-            _draw_frames(f, hit, hit_frame, shape, full_well, b, keys[1], p, group)
-        else:
+    # The pixels are processed in blocks, in loops that the compiler can vectorise. In memory, the rows of a block must
+    # not be a multiple of 4 KiB apart, because such addresses share their place in the processor's cache.
+    block = pixel_random.BLOCK
+    normals, bits = np.empty((groups + 1, block + 8)), np.empty(block, np.uint64)
+    counts, work, rate = np.empty((groups, block + 8)), np.empty((5, block + 8)), np.empty(block)
+    is_linear = np.empty(block, np.bool_)
+    for start in range(0, size, block):
+        width, linear = min(block, size - start), 0
+        for j in range(width):
+            rate[j] = max(light[start + j], 0.0) / ((groups - 1) * (reads + drops))
+            end = rate[j] * frames
+            is_hit = len(hit_charge) > 0 and hit_charge[start + j] != 0.0
+            is_linear[j] = not (is_hit or end > linear_below or end + 10.0 * math.sqrt(end) > full_well)
+            linear += is_linear[j]
+        if linear:
             for i in range(groups + 1):
-                e[i] = pixel_random.normal(pixel_random.pixel_bits(keys[0], p + i * size))
-            _draw_groups(f, shape, cumulants, e, group)
-            for i in range(groups):
-                group[i] -= b * f * f * squares[i]
+                pixel_random.fill_normals(normals[i, :width], bits, keys[0], start + i * size)
+            _draw_groups(rate[:width], shape, cumulants, normals, work, counts)
+            if len(coefficient) > 0:
+                for i in range(groups):
+                    for j in range(width):
+                        counts[i, j] -= coefficient[start + j] * rate[j] * rate[j] * squares[i]
+        if linear < width:
+            for j in range(width):
+                if not is_linear[j]:
+                    hit, hit_frame = 0.0, 0
+                    if len(hit_charge) > 0:
+                        hit, hit_frame = hit_charge[start + j], int(hit_time[start + j] * frames)
+                    b = coefficient[start + j] if len(coefficient) > 0 else 0.0
+                    _draw_frames(rate[j], hit, hit_frame, shape, full_well, b, keys[1], start + j, group)
+                    for i in range(groups):
+                        counts[i, j] = group[i]
         for i in range(groups):
-            out[i, p] = group[i]
+            out[i, start : start + width] = counts[i, :width]
 
 
 @jit
-def _draw_groups(f: float, shape: Any, cumulants: Any, e: Any, group: Any) -> None:
-    """Fill `group` with the electrons of the groups (averaged reads) of a pixel, from groups + 1 normal deviates `e`.
+def _draw_groups(rate: Any, shape: Any, cumulants: Any, e: Any, work: Any, counts: Any) -> None:
+    """Fill `counts` with the electrons of the groups (averaged reads) of n pixels, from normal deviates `e`.
 
-    `f` is the number of expected electrons per frame (read of the detector). `shape` has the number of groups, of reads
-    per group and of dropped frames between groups. `cumulants` is the result of `Mode.third_moments`, three constants
-    for the skewness of the counts. The method is the moving average that the module docstring describes.
+    Parameters
+    ----------
+    rate : float array, shape (n,)
+        Expected electrons per frame (read of the detector).
+    shape : tuple of int
+        Number of groups, of reads per group and of dropped frames between groups.
+    cumulants : tuple of float
+        Result of `Mode.third_moments`, three constants for the skewness of the counts.
+    e : float array, shape (groups + 1, n or more)
+        Standard normal deviates.
+    work : float array, shape (5, n or more)
+        Scratch memory.
+    counts : float array, shape (groups, n or more)
+        Result, changed in place: electrons of each group.
+
+    Notes
+    -----
+    The method is the moving average that the module docstring describes.
     """
     groups, reads, drops = shape
     n = groups - 1
     r = float(reads)
-    a = f * ((r + drops) + (1.0 - r * r) / (3.0 * r))
-    b = f * (r * r - 1.0) / (6.0 * r)
-    v = f * (r + 1.0) * (2.0 * r + 1.0) / (6.0 * r)
-    high, low = math.sqrt(a + 2.0 * b), math.sqrt(max(a - 2.0 * b, 0.0))
+    unit_a = (r + drops) + (1.0 - r * r) / (3.0 * r)
+    unit_b = (r * r - 1.0) / (6.0 * r)
+    unit_v = (r + 1.0) * (2.0 * r + 1.0) / (6.0 * r)
+    high, low = math.sqrt(unit_a + 2.0 * unit_b), math.sqrt(max(unit_a - 2.0 * unit_b, 0.0))
     # c0 and c1 are the coefficients of the moving average, and b is the covariance of successive differences. The
-    # formula c1 = (high - low) / 2 would lose digits for small b. Use c0 c1 = b instead.
-    c0 = 0.5 * (high + low)
-    c1 = b / c0 if c0 > 0.0 else 0.0
-    total, square = 0.0, 0.0
-    for i in range(n):
-        group[i + 1] = c1 * e[i + 1] + c0 * e[i]
-        total += group[i + 1]
-    for i in range(n):
-        square += (group[i + 1] - total / n) ** 2
+    # formula c1 = (high - low) / 2 would lose digits for small b. Use c0 c1 = b instead. For f electrons per frame all
+    # moments are proportional to f, and c0 and c1 to its root.
+    unit_c0 = 0.5 * (high + low)
+    unit_c1 = unit_b / unit_c0
+    unit_first = math.sqrt(max(unit_v - unit_c1 * unit_c1, 0.0))
     k3, k_mixed, c4 = cumulants
-    shift = 0.0
-    v_t = n * a + 2.0 * (n - 1) * b
-    if v_t > 0.0:
-        shift = k3 * f * (total * total / v_t - 1.0) / (6.0 * v_t)
-        if n > 1:
-            ends = (n - 2) * (a + 2.0 * b) ** 2 + 2.0 * (a + b) ** 2
-            v_g = 2.0 * (n * a * a + 2.0 * (n - 1) * b * b - 2.0 / n * ends + v_t * v_t / (n * n))
-            v_s = v_g + f * c4
-            mixed = k_mixed * f
-            fraction = mixed / v_t * (v_g / v_s) * (mixed / v_s)
-            # The factor of `total` is sqrt(1 - fraction) - 1, written without cancellation of digits.
-            shift += total * (-fraction / (1.0 + math.sqrt(1.0 - fraction)))
-            shift += mixed / v_s * (square - (n * a - v_t / n))
-    group[0] = 0.5 * f * (r + 1.0) + c1 * e[0] + math.sqrt(max(v - c1 * c1, 0.0)) * e[groups]
+    unit_vt = n * unit_a + 2.0 * (n - 1) * unit_b
+    ends = (n - 2) * (unit_a + 2.0 * unit_b) ** 2 + 2.0 * (unit_a + unit_b) ** 2
+    unit_vg = 2.0 * (n * unit_a**2 + 2.0 * (n - 1) * unit_b**2 - 2.0 / n * ends + unit_vt**2 / (n * n))
+    root, mean, square, step, total = work
+    for j in range(len(rate)):
+        root[j], total[j], square[j] = math.sqrt(rate[j]), 0.0, 0.0
+        counts[0, j] = 0.5 * rate[j] * (r + 1.0) + root[j] * (unit_c1 * e[0, j] + unit_first * e[groups, j])
     for i in range(n):
-        group[i + 1] += group[i] + f * (r + drops) + shift / n
+        for j in range(len(rate)):
+            counts[i + 1, j] = root[j] * (unit_c1 * e[i + 1, j] + unit_c0 * e[i, j])
+            total[j] += counts[i + 1, j]
+    for j in range(len(rate)):
+        mean[j] = total[j] / n
+    for i in range(n):
+        for j in range(len(rate)):
+            square[j] += (counts[i + 1, j] - mean[j]) ** 2
+    for j in range(len(rate)):
+        # A pixel without light has no shift. The number 1 avoids a division by zero.
+        f = rate[j] if rate[j] > 0.0 else 1.0
+        shift = k3 * (total[j] * total[j] / (f * unit_vt) - 1.0) / (6.0 * unit_vt)
+        if n > 1:
+            v_g, mixed = f * f * unit_vg, k_mixed * f
+            v_s = v_g + f * c4
+            fraction = k_mixed / unit_vt * (v_g / v_s) * (mixed / v_s)
+            # The factor of `total` is sqrt(1 - fraction) - 1, written without cancellation of digits.
+            shift += total[j] * (-fraction / (1.0 + math.sqrt(1.0 - fraction)))
+            shift += mixed / v_s * (square[j] - f * (n * unit_a - unit_vt / n))
+        step[j] = rate[j] * (r + drops) + (shift / n if rate[j] > 0.0 else 0.0)
+    for i in range(n):
+        for j in range(len(rate)):
+            counts[i + 1, j] += counts[i, j] + step[j]
 
 
 @jit

@@ -76,8 +76,12 @@ def apply(frame: Frame, sigma: float, reads: int, rng: np.random.Generator) -> F
 
 @jit
 def _add(frame: Any, out: Any, sigma: float, key: Any) -> None:
-    for i in range(len(frame)):
-        out[i] = frame[i] + sigma * pixel_random.normal(pixel_random.pixel_bits(key, i))
+    normals, bits = np.empty(pixel_random.BLOCK), np.empty(pixel_random.BLOCK, np.uint64)
+    for start in range(0, len(frame), pixel_random.BLOCK):
+        block, filled = frame[start : start + pixel_random.BLOCK], out[start : start + pixel_random.BLOCK]
+        pixel_random.fill_normals(normals[: len(block)], bits, key, start)
+        for i in range(len(block)):
+            filled[i] = block[i] + sigma * normals[i]
 
 
 def apply_drift(frame: Frame, width: float, rng: np.random.Generator) -> Frame:
@@ -161,10 +165,13 @@ def apply_reset(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:
 
 @jit
 def _add_levels(groups: Any, out: Any, sigma: float, key: Any) -> None:
-    for p in range(groups.shape[1]):
-        level = sigma * pixel_random.normal(pixel_random.pixel_bits(key, p))
+    normals, bits = np.empty(pixel_random.BLOCK), np.empty(pixel_random.BLOCK, np.uint64)
+    for start in range(0, groups.shape[1], pixel_random.BLOCK):
+        width = min(pixel_random.BLOCK, groups.shape[1] - start)
+        pixel_random.fill_normals(normals[:width], bits, key, start)
         for i in range(len(groups)):
-            out[i, p] = groups[i, p] + level
+            for j in range(width):
+                out[i, start + j] = groups[i, start + j] + sigma * normals[j]
 
 
 def _one_over_f(count: int, rng: np.random.Generator, slowest: int = 1) -> Frame:
