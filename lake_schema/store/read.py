@@ -42,7 +42,7 @@ _COMMANDS = {
     "plan": ("mission", "exposures", "tasks"),
 }
 # Commands that make optional tables.
-_OPTIONAL_TABLES = {
+OPTIONAL_TABLES = {
     "strong_lenses": "lenses", "transients": "transients", "active_nuclei": "nuclei", "lensed_images": "lensed",
 }  # fmt: skip
 
@@ -687,8 +687,8 @@ def _missing_input(root: Folder, name: str, request: str) -> BadInput:
     remedy = f"run truesky run REQUEST {root}, or first truesky {commands}"
     if not layout.table_names(root):
         return BadInput(f"lake {root} has no tables: {remedy}")
-    if name in _OPTIONAL_TABLES:
-        remedy = f"run truesky {_OPTIONAL_TABLES[name]} REQUEST {root}"
+    if name in OPTIONAL_TABLES:
+        remedy = f"run truesky {OPTIONAL_TABLES[name]} REQUEST {root}"
     existing = ", ".join(request_links.request_names(root)) or "none"
     return BadInput(f"lake {root} has no table {name} of request {request}: {remedy}; requests of the lake: {existing}")
 

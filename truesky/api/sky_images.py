@@ -492,7 +492,10 @@ def find_tables(versions: Mapping[str, read.Version], root: Folder) -> PainterTa
             raise BadInput(f"lake {root}: has no table {name}, which images need")
     for name in _OPTIONAL[1:]:
         if name in versions and versions[name].manifest["facts"].get("galaxies") != versions["galaxies"].key:
-            raise BadInput(f"lake {root}: {name} was made from another version of galaxies: run build_{name} first")
+            command = read.OPTIONAL_TABLES[name]
+            raise BadInput(
+                f"lake {root}: {name} was made from another version of galaxies: run truesky {command} first"
+            )
     names = [name for name in (*_CATALOGUES, *_OPTIONAL, *_PLANNED, "products") if name in versions]
     return PainterTables(root, tuple((name, versions[name].key) for name in names))
 

@@ -48,10 +48,10 @@ def steps(lake: Path, request: Request) -> list[Step]:
     if missing := [name for name in gaia.FLUX_COLUMNS if name not in fluxes.schema.names]:
         raise BadInput(
             f"table star_fluxes has no column {', '.join(missing)}: put {', '.join(gaia.BANDS)} into fluxes.bands and "
-            "run compute_fluxes"
+            "run truesky fluxes"
         )
     if fluxes.manifest["facts"].get("input") != stars.key:
-        raise BadInput("table star_fluxes was computed from another version of stars: run compute_fluxes first")
+        raise BadInput("table star_fluxes was computed from another version of stars: run truesky fluxes first")
     facts = {"seed": request.seed, "stars": stars.key, "star_fluxes": fluxes.key, "code": code_version()}
     tasks = tuple(Task(name, {"part": name}) for name in stars.partitions)
     declared = with_variable_flag(GAIA) if "variability" in stars.schema.names else GAIA

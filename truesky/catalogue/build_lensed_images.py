@@ -56,7 +56,8 @@ def steps(lake: Path, request: Request) -> list[Step]:
     for name in names:
         version = read.input_version(lake, name, request.name)
         if version.manifest["facts"].get("galaxies") != galaxies.key:
-            raise BadInput(f"table {name} was drawn in another version of galaxies: run build_{name} first")
+            command = read.OPTIONAL_TABLES[name]
+            raise BadInput(f"table {name} was drawn in another version of galaxies: run truesky {command} first")
         facts[name] = version.key
     cells_by_partition = {part["name"]: part["facts"]["generation_cells"] for part in galaxies.manifest["parts"]}
     tasks = tuple(

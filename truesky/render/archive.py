@@ -76,7 +76,7 @@ def exposures(root: Path, request: str | None = None) -> pa.Table:
     """
     version, images = (read.version(root, name, request=request) for name in ("exposure_files", "products"))
     if version.manifest["facts"]["products"] != images.key:
-        raise BadInput('table exposure_files has outdated images: run render_exposures with files = "exposure"')
+        raise BadInput('table exposure_files has outdated images: run truesky render with files = "exposure"')
     rows, files = version.rows(), {entry["path"]: entry for entry in version.manifest["files"]}
     file_values = [[files[path][key] for path in rows["path"].to_pylist()] for key in ("sha256", "bytes")]
     return rows.append_column("sha256", pa.array(file_values[0], pa.string())).append_column(

@@ -43,8 +43,8 @@ def check_catalogues(catalogues: Iterable[read.Version], request: Request) -> No
     """
     for version in catalogues:
         if different := _difference(version, request):
-            first = f"run build_{version.table} first, then compute_fluxes"
-            raise BadInput(f"table {version.table} has {different}: {first}")
+            remedy = "run truesky build first, then truesky fluxes"
+            raise BadInput(f"table {version.table} has {different}: {remedy}")
 
 
 def check_lake(root: Path, request: Request) -> None:

@@ -75,7 +75,7 @@ def templates_from_facts(recorded: Mapping[str, Any]) -> Mapping[int, Template]:
         return supernova_templates.templates()
     path, sha256 = Path(recorded[_KEY]["path"]), recorded[_KEY]["sha256"]
     if _checksum(path) != sha256:
-        raise BadInput(f"{path}: has changed since the transients were drawn: run build_transients again")
+        raise BadInput(f"{path}: has changed since the transients were drawn: run truesky transients again")
     return {**supernova_templates.templates(), TYPE_IA: _read_known(path, sha256)}
 
 

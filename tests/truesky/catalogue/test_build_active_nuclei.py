@@ -44,5 +44,5 @@ def test_a_request_without_variable_sources_is_refused(tmp_path):
 def test_galaxies_without_variable_sources_are_refused(tmp_path):
     made(tmp_path, {"box_cells": 256})
     path = requests.written(tmp_path, "[universe]\nvariables = true\n", seed=7)
-    with pytest.raises(BadInput, match="table galaxies has variables False, the request True: run build_galaxies"):
+    with pytest.raises(BadInput, match="table galaxies has variables False, the request True: run truesky build"):
         build_active_nuclei.steps(tmp_path, parse(path))

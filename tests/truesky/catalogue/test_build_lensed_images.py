@@ -142,5 +142,7 @@ def test_a_lake_without_transients_has_images_of_quasars_only(tmp_path, tables):
 
 def test_tables_of_another_version_of_the_galaxies_are_refused(tmp_path, tables):
     request = stored_lake(tmp_path, tables, key="other")
-    with pytest.raises(BadInput, match="strong_lenses was drawn in another version of galaxies: run build_strong_len"):
+    with pytest.raises(
+        BadInput, match="strong_lenses was drawn in another version of galaxies: run truesky lenses first"
+    ):
         build_lensed_images.steps(tmp_path, request)

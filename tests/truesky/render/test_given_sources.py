@@ -141,7 +141,7 @@ def test_the_image_has_no_other_sources(rendered, images):
 
 
 def test_a_lake_of_other_sources_is_refused(rendered, tmp_path):
-    with pytest.raises(BadInput, match="table galaxies has other sources than the request: run build_galaxies first"):
+    with pytest.raises(BadInput, match="table galaxies has other sources than the request: run truesky build first"):
         render_exposures.steps(rendered, written(tmp_path, galaxies={**GALAXY, "mag": 22.0}))
     universe = parse(
         requests.written(

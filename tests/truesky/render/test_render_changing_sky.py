@@ -62,7 +62,7 @@ def test_keys_depend_on_the_new_tables(lake, monkeypatch):
 
 
 def test_another_window_is_refused_until_its_supernovae_are_drawn(lake):
-    with pytest.raises(BadInput, match="table transients was drawn with another end: run build_transients first"):
+    with pytest.raises(BadInput, match="table transients was drawn with another end: run truesky transients first"):
         render_exposures.steps(lake, wanted(end=60920.0))
 
 

@@ -523,7 +523,9 @@ def test_strong_lenses_of_the_lake_are_drawn(rendered, monkeypatch):
         "refuse_other_plan",
         lambda inputs, *others: ahead({**inputs, "strong_lenses": other}, *others),
     )
-    with pytest.raises(BadInput, match="strong_lenses was drawn in another version of galaxies: run build_strong_lens"):
+    with pytest.raises(
+        BadInput, match="strong_lenses was drawn in another version of galaxies: run truesky lenses first"
+    ):
         render_exposures.steps(lake, crowded)
 
 
@@ -643,7 +645,7 @@ def test_missing_cells_are_refused_before_rendering(lake):
     far = {**REQUEST["pointing"][0], "dec": -29.0}
     request = wanted(pointing=[far])
     make(lake, request, plan_exposures)
-    with pytest.raises(BadInput, match=r"table galaxies lacks \d+ order-8 cells .*: run build_galaxies over an area"):
+    with pytest.raises(BadInput, match=r"table galaxies lacks \d+ order-8 cells .*: run truesky build over an area"):
         render_exposures.steps(lake, request)
     assert not (lake / "products").exists()
 
@@ -651,10 +653,10 @@ def test_missing_cells_are_refused_before_rendering(lake):
 @nightly.parametrize(
     ("other", "words"),
     [
-        ({"seed": 8}, "table galaxies has seed 7, the request 8: run build_galaxies first"),
-        ({"galaxy_limit": 24.0}, "table galaxies has galaxy_limit 23.5, the request 24.0: run build_galaxies first"),
-        ({"lensing": "none"}, r"table galaxies has lensing None, the request \(0.0, 0.0\): run build_galaxies first"),
-        ({"star_limit": 21.0}, "table stars has star_limit 20.0, the request 21.0: run build_stars first"),
+        ({"seed": 8}, "table galaxies has seed 7, the request 8: run truesky build first"),
+        ({"galaxy_limit": 24.0}, "table galaxies has galaxy_limit 23.5, the request 24.0: run truesky build first"),
+        ({"lensing": "none"}, r"table galaxies has lensing None, the request \(0.0, 0.0\): run truesky build first"),
+        ({"star_limit": 21.0}, "table stars has star_limit 20.0, the request 21.0: run truesky build first"),
     ],
     (0, 2),
 )

@@ -60,14 +60,14 @@ def test_every_fact_of_a_catalogue_is_compared():
 @pytest.mark.parametrize(
     ("table", "other", "words"),
     [
-        ("galaxies", wanted(seed=12), "table galaxies has seed 11, the request 12: run build_galaxies first"),
+        ("galaxies", wanted(seed=12), "table galaxies has seed 11, the request 12: run truesky build first"),
         ("galaxies", wanted(galaxy_limit=24.0), "table galaxies has galaxy_limit 26.0, the request 24.0"),
         (
             "galaxies",
             wanted(cosmology={"w0": -0.9}),
-            "table galaxies has the cosmology w0 = -1.0, the request w0 = -0.9: run build_galaxies first",
+            "table galaxies has the cosmology w0 = -1.0, the request w0 = -0.9: run truesky build first",
         ),
-        ("stars", wanted(seed=12), "table stars has seed 11, the request 12: run build_stars first, then compute_fl"),
+        ("stars", wanted(seed=12), "table stars has seed 11, the request 12: run truesky build first, then truesky fl"),
         ("stars", wanted(star_limit=20.0), "table stars has star_limit 26.0, the request 20.0"),
         (
             "stars",

@@ -99,7 +99,7 @@ def open_catalogue(lake: Path, table: str, request: str | None = None, beginning
     fluxes = read.version(lake, FLUXES[table], request=request)
     if fluxes.manifest["facts"].get("input") != rows.key:
         raise BadInput(
-            f"table {fluxes.table} was computed from another version of {rows.table}: run compute_fluxes first"
+            f"table {fluxes.table} was computed from another version of {rows.table}: run truesky fluxes first"
         )
     start = f"f_nu_{beginning}"
     bands = [name.removeprefix("f_nu_") for name in fluxes.schema.names if name.startswith(start)]

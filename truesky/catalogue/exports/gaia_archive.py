@@ -90,7 +90,7 @@ def _release_columns(version: read.Version, partition: str, epoch: float | None)
     """
     rows = version.rows(partitions=[partition])
     if rows.num_rows and rows["ruwe"].null_count:
-        raise BadInput("table gaia has no proper motions: it was built by an older version; run build_gaia again")
+        raise BadInput("table gaia has no proper motions: it was built by an older version; run truesky gaia again")
     columns: dict[str, Any] = {name: rows[name] for name in rows.column_names}
     columns |= {"source_id": rows["id"], "bp_rp": pc.subtract(rows["phot_bp_mean_mag"], rows["phot_rp_mean_mag"])}
     catalogue_epoch = parameters.section("gaia.toml", "astrometry")["epoch"]

@@ -102,7 +102,7 @@ def _catalogue(lake: Path, table: str, request: str | None) -> Catalogue:
     catalogue = catalogues.open_catalogue(lake, table, request, "lsst_")
     if not catalogue.bands:
         name = catalogues.FLUXES[table]
-        raise BadInput(f"table {name} has no LSST band: put lsst_r into fluxes.bands and run compute_fluxes")
+        raise BadInput(f"table {name} has no LSST band: put lsst_r into fluxes.bands and run truesky fluxes")
     return catalogue
 
 

@@ -53,7 +53,7 @@ def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request, miss
     ------
     BadInput
         If a table was made for another request or other mission parameters. Also if fluxes or lenses were computed from
-        another version of the catalogue, or fluxes with other passbands. The message names the job to run.
+        another version of the catalogue, or fluxes with other passbands. The message names the command to run.
     """
     universe.check_catalogues([inputs[name] for name in universe.CATALOGUES], request)
     facts = {name: version.manifest["facts"] for name, version in inputs.items()}
@@ -61,25 +61,25 @@ def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request, miss
     expected = {"request": request.facts(*PLAN_SECTIONS), "mission": mission.fingerprint, **filters}
     for name in ("exposures", "tasks"):
         if canonical({key: facts[name].get(key) for key in expected}) != canonical(expected):
-            raise BadInput(f"table {name} was planned for another request: run plan_exposures first")
+            raise BadInput(f"table {name} was planned for another request: run truesky plan first")
     if facts["mission"].get("mission") != expected["mission"]:
-        raise BadInput("table mission was planned for another request: run plan_exposures first")
+        raise BadInput("table mission was planned for another request: run truesky plan first")
     if LENSES in inputs and facts[LENSES].get("galaxies") != inputs["galaxies"].key:
-        raise BadInput(f"table {LENSES} was drawn in another version of galaxies: run build_strong_lenses first")
+        raise BadInput(f"table {LENSES} was drawn in another version of galaxies: run truesky lenses first")
     if ACTIVE_NUCLEI in inputs and facts[ACTIVE_NUCLEI].get("galaxies") != inputs["galaxies"].key:
-        raise BadInput(f"table {ACTIVE_NUCLEI} was drawn in another version of galaxies: run build_active_nuclei first")
+        raise BadInput(f"table {ACTIVE_NUCLEI} was drawn in another version of galaxies: run truesky nuclei first")
     if LENSED_IMAGES in inputs:
         for name in (LENSES, TRANSIENTS):
             if facts[LENSED_IMAGES].get(name) != (inputs[name].key if name in inputs else None):
-                raise BadInput(f"table {LENSED_IMAGES} was made with another {name}: run build_lensed_images first")
+                raise BadInput(f"table {LENSED_IMAGES} was made with another {name}: run truesky lensed first")
     if TRANSIENTS in inputs:
         _refuse_other_transients(facts[TRANSIENTS], inputs["galaxies"].key, request)
     for catalogue, fluxes in CATALOGUES:
         if facts[fluxes].get("input") != inputs[catalogue].key:
-            raise BadInput(f"table {fluxes} was computed from another version of {catalogue}: run compute_fluxes first")
+            raise BadInput(f"table {fluxes} was computed from another version of {catalogue}: run truesky fluxes first")
         for key, sha256 in filters.get("files", {}).items():
             if facts[fluxes]["files"].get(key) != sha256:
-                raise BadInput(f"table {fluxes} was computed with another {key}: run compute_fluxes first")
+                raise BadInput(f"table {fluxes} was computed with another {key}: run truesky fluxes first")
 
 
 def _refuse_other_transients(facts: Json, galaxies: str, request: Request) -> None:
@@ -93,7 +93,7 @@ def _refuse_other_transients(facts: Json, galaxies: str, request: Request) -> No
     expected |= spectral_series.facts(settings.light_curves) or {"light_curves": None}
     for key, value in expected.items():
         if canonical(facts.get(key)) != canonical(value):
-            raise BadInput(f"table {TRANSIENTS} was drawn with another {key}: run build_transients first")
+            raise BadInput(f"table {TRANSIENTS} was drawn with another {key}: run truesky transients first")
 
 
 def require_renderable_tasks(exposures: pa.Table, tasks: pa.Table) -> pa.Table:
@@ -151,7 +151,7 @@ def refuse_uncovered(catalogue: read.Version, cells: set[int]) -> None:
     if missing := sorted(cells - catalogue_rows.drawn_cells(catalogue)):
         examples = ", ".join(map(str, missing[:3])) + (", ..." if len(missing) > 3 else "")
         missing_cells = f"{len(missing)} order-{GENERATION_ORDER} cells that the detectors observe ({examples})"
-        remedy = f"run build_{catalogue.table} over an area that contains all detectors, then compute_fluxes"
+        remedy = "run truesky build over an area that contains all detectors, then truesky fluxes"
         raise BadInput(f"table {catalogue.table} lacks {missing_cells}: {remedy}")
 
 

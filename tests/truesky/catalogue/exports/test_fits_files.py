@@ -78,4 +78,4 @@ def test_fluxes_of_other_galaxies_are_refused(lake, tmp_path, capsys):
     publish.make_version(lake, Plan(table, {"input": "other"}, (part,)), lambda root, facts: Output(rows))
     arguments = ["export", "galaxies", str(lake), "--out", str(tmp_path / "out"), "--form", "skycatalogs"]
     assert truesky.main(arguments) == 2
-    assert "run compute_fluxes first" in capsys.readouterr().err
+    assert "run truesky fluxes first" in capsys.readouterr().err

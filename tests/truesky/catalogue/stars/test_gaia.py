@@ -266,7 +266,7 @@ def test_missing_inputs_are_named(lake):
     }
     part = (Task(layout.cell_file(5, 1607), {}),)
     publish.make_version(lake, Plan(flux, {}, part), lambda root, facts: Output(flux.build(rows)))
-    with pytest.raises(BadInput, match=r"no column f_nu_gaia_g, .* into fluxes\.bands and run compute_fluxes"):
+    with pytest.raises(BadInput, match=r"no column f_nu_gaia_g, .* into fluxes\.bands and run truesky fluxes"):
         build_gaia.steps(lake, asked())
 
 
