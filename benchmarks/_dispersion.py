@@ -47,7 +47,7 @@ _BRIGHT, _FAINT = 17.0, 23.0
 # Electrons of a source of magnitude 0, for a zero point of 25.3 mag (1 electron per s) and 549.6 s.
 _ZERO = 549.6 * 10 ** (0.4 * 25.3)
 # Parameters of the slow method to which the drawn spectra are compared.
-TRUTH = Settings(edge=1e-5, faint=0.0, min_size=80, along=4, across=4, block=0.0, nodes=10, positions=9)
+TRUTH = Settings(edge=1e-5, faint=0.0, min_size=80, along=4, across=4, block=0.0, nodes=10, positions=9, bin=0.0)
 # Shape (ny, nx) of the image of one spectrum, pixels.
 _SHAPE = (128, 720)
 # Column and row at which the source of a spectrum would lie on the image without the grism. A random fraction of a

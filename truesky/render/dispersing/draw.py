@@ -111,6 +111,10 @@ class Settings:
     separable : float
         A spectral order is drawn as a product of a profile along and a profile across the trace (separable.py) if all
         light in its brightest column is below this limit. With 0 no order is.
+    bin : float
+        Distance, in pixels along the trace, of the wavelengths at which the light of a spectrum is summed before it is
+        drawn (wavelength_bins.py). With 0 every wavelength is drawn. With 0.25 an emission line of a star, which is as
+        narrow as the PSF allows, changes by less than 1e-3 of its peak.
     """
 
     edge: float = 0.003
@@ -122,6 +126,7 @@ class Settings:
     nodes: int = 4
     positions: int = 9
     separable: float = 0.0
+    bin: float = 0.25
 
 
 # File with one row of settings (attributes of `Settings`) per accuracy. The column `allowed` is the allowed error of
@@ -410,8 +415,7 @@ class _OrderPlan:
         step = 1.0 / (order.trace.last - order.trace.first)
         t = (order.first - order.trace.first) * step, step
         share = images.shares(order.wavelength, psf.planes.wavelength)
-        bins = Bins.from_trace(along, order.trace.last - order.trace.first, order.response, share)
-        return cls(order, angstrom_per_pixel, tile, t, bins)
+        return cls(order, angstrom_per_pixel, tile, t, Bins.from_trace(along, t, order.response, share, settings.bin))
 
 
 @dataclass(frozen=True, slots=True)

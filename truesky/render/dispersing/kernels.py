@@ -11,7 +11,7 @@ from truesky.numerics.compiling import jit
 from truesky.render.drawing.kernels import fourier
 from truesky.render.drawing.kernels.frame import min_singular_squared
 
-# Number of wavelengths of a spectrum that `add_to_trace` processes together, in vector operations.
+# Number of bins of a spectrum that `add_to_trace` processes together, in vector operations.
 _WAVES = 64
 
 
@@ -129,18 +129,18 @@ def add_to_trace(
     Parameters
     ----------
     electrons : float array, shape (w,)
-        Electrons by wavelength.
+        Electrons in w bins of wavelength, which are evenly spaced.
     along : float array, shape (i,)
         Coefficients of t^i (i from 0) of the displacement from the undispersed image in columns, pixels. The parameter
         t is linear in wavelength.
     times : (float, float)
-        Value of t at the first wavelength, and step of t from one wavelength to the next.
+        Value of t at the first bin, and step of t from one bin to the next.
     start : float
         Column of the undispersed image, pixels from 0.
     samples : int
         Samples per pixel (column).
     share : float array, shape (b, w)
-        Weights that interpolate the PSF at each wavelength from the PSFs at b wavelengths. The electrons are divided
+        Weights that interpolate the PSF in each bin from the PSFs at b wavelengths. The electrons are divided
         among the b rows of `out` in these proportions.
     first : int
         Position of the first sample in `out`: its column on the detector times `samples`.
@@ -150,7 +150,7 @@ def add_to_trace(
 
     Notes
     -----
-    The light of each wavelength is distributed among the six nearest samples by a quintic B-spline. This conserves the
+    The light of each bin is distributed among the six nearest samples by a quintic B-spline. This conserves the
     number of electrons and their mean position.
     """
     count, places, low = out.shape[1], np.empty(_WAVES), np.empty(_WAVES, np.int64)
@@ -160,7 +160,7 @@ def add_to_trace(
         batch = electrons[begin : begin + _WAVES]
         if np.max(np.abs(batch)) == 0.0:
             continue
-        # Compute the displacements of all wavelengths of the batch in a separate loop, which the compiler can
+        # Compute the displacements of all bins of the batch in a separate loop, which the compiler can
         # vectorise.
         places[:] = along[len(along) - 1]
         for j in range(len(along) - 2, -1, -1):
@@ -180,7 +180,7 @@ def add_to_trace(
             w3[i] = e * (66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s)))
         group_start, stop = 0, 0
         while group_start < len(batch):
-            # Successive wavelengths that lie between the same two samples are distributed among the same six samples.
+            # Successive bins that lie between the same two samples are distributed among the same six samples.
             # Their light is summed before it is added to `out`.
             at, stop = low[group_start], group_start + 1
             while stop < len(batch) and low[stop] == at:
@@ -195,10 +195,9 @@ def add_to_trace(
 
 @jit
 def _add_weighted(weights: Float, share: Float, out: Float) -> None:
-    """Add the electrons of k wavelengths that are drawn with one PSF to six successive samples of a trace, `out` [6].
+    """Add the electrons of k bins that are drawn with one PSF to six successive samples of a trace, `out` [6].
 
-    `weights` [6, k] are the electrons of each wavelength in each sample, and `share` [k] the weight of the PSF at each
-    wavelength.
+    `weights` [6, k] are the electrons of each bin in each sample, and `share` [k] the weight of the PSF in each bin.
     """
     w0, w1, w2, w3, w4, w5 = weights
     s0 = s1 = s2 = s3 = s4 = s5 = 0.0

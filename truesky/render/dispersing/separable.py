@@ -20,7 +20,7 @@ from truesky.render.dispersing.kernels import add_to_trace
 from truesky.render.dispersing.spreading import add_piece
 from truesky.render.dispersing.wavelength_bins import BINS_BEFORE
 
-# Number of samples along the trace that are drawn with the same PSF.
+# Number of samples along the trace that are drawn with the same PSF, and so are the columns that they span.
 _SAMPLES = 16
 
 
@@ -119,8 +119,8 @@ def draw_product(
 
     Notes
     -----
-    In each column, the profile across the trace is placed at the mean row of the light in this column. A few
-    neighbouring columns have the same PSF, for the mean wavelength of their light.
+    In each column, the profile across the trace is placed at the mean row of the light in this column. Columns that
+    span 16 samples have the same PSF, for the mean wavelength of their light.
     """
     n, ox, oy = shape
     ny, nx = frame.shape
@@ -155,14 +155,15 @@ def draw_product(
     _sum_columns(along_profile, trace, first, share, ox, begin, columns)
     piece = np.zeros((height, wide), np.float32)
     profiles, wrapped = np.empty((oy + 3, n), np.float32), np.empty(n * oy + oy + 4, np.float32)
-    for group in range(0, wide, _SAMPLES // ox):
-        part = columns[:, group : group + _SAMPLES // ox]
+    step = max(_SAMPLES // ox, 1)
+    for group in range(0, wide, step):
+        part = columns[:, group : group + step]
         light, number = np.sum(part[0]), np.sum(part[2])
         if light == 0.0:
             continue
         number = int(min(max(number / light, 0.0), count - 1.0))
         _mix_rows(across_profile, share[number], oy, wrapped, profiles)
-        for c in range(group, min(group + _SAMPLES // ox, wide)):
+        for c in range(group, min(group + step, wide)):
             if columns[0, c] != 0.0:
                 row = min(max(columns[1, c] / columns[0, c], bottom), top) + shear * (begin + c)
                 _add_column(profiles, columns[0, c], row, low_row, piece[:, c])
@@ -202,6 +203,7 @@ def _add_column(profiles: Float32, light: float, row: float, low: int, out: Floa
     oy, n = len(profiles) - 3, profiles.shape[1]
     begin = int(np.ceil(row - n // 2))
     v = oy * (begin - row + n // 2)
+    # Rounding can make v equal to oy.
     first = min(int(np.floor(v)), oy - 1)
     t = v - first
     s = 1.0 - t

@@ -549,9 +549,9 @@ def spread(
     trace_electrons = np.zeros((1 if tile > 0 else share.shape[1], int(np.ceil(ox * x_last)) + 4 + ox - first))
     # For a straight trace, `convolve_trace` applies the interpolation weights of the PSFs later. So the electrons are
     # distributed along the trace as if there were only one PSF.
-    wave_share = np.ones((1, len(electrons))) if tile > 0 else bin_share
+    trace_share = np.ones((1, len(electrons))) if tile > 0 else bin_share
     bin_times = times[0] - BINS_BEFORE * width * times[1], width * times[1]
-    add_to_trace(electrons, along, bin_times, start[0], ox, wave_share, first, trace_electrons)
+    add_to_trace(electrons, along, bin_times, start[0], ox, trace_share, first, trace_electrons)
     steepest = max(np.abs(_slope(path, 0)), np.abs(_slope(path, _NODES - 2)))
     wing = (steepest if tile > 0 else abs(shear)) * (n // 2 + 2.0)
     begin = max(int(np.floor(x_first)) - n // 2 - 2, 0), max(int(np.floor(bottom - wing)) - n // 2 - 1, 0)

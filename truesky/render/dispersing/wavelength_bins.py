@@ -1,7 +1,7 @@
-"""Sum the light of a slitless spectrum in bins of wavelength, which is faster to draw than every wavelength.
+"""Sum the light of a slitless spectrum at fewer wavelengths, which are faster to draw than every Angstrom.
 
-The light of a wavelength is divided among the six nearest bins so that it is conserved with its mean place and its
-higher moments. A bin is a fraction of a pixel along the trace, so that the error is far below the errors of the PSF.
+The light of a wavelength is divided among the six nearest of these wavelengths, which are called bins. The weights
+conserve the light, its mean place and its higher moments. Bins are a fraction of a pixel apart along the trace.
 """
 
 from __future__ import annotations
@@ -16,27 +16,17 @@ from truesky.numerics.compiling import jit
 # Number of wavelength bins before the first wavelength of a spectrum, and after the last, to which `bin_electrons` adds
 # light.
 BINS_BEFORE, BINS_AFTER = 2, 3
-# Widest bin of `bin_electrons`, in pixels along the trace. An emission line that is as narrow as the PSF allows then
-# has an error of at most 5e-4 of its peak.
-BIN_PIXELS = 0.3
-# Largest number of wavelengths in a bin. Wider bins would not save time.
+# Largest number of wavelengths in a bin. Zeroth orders then have about a hundred bins.
 _WIDEST_BIN = 64
 # Number of positions along a trace between which its dispersion is measured.
 _PLACES = 33
 
 
-def bin_width(angstrom_per_pixel: float) -> int:
-    """Return the number of wavelengths (in steps of 1 Angstrom) in a bin of `bin_electrons`, 1 to 64.
-
-    `angstrom_per_pixel` is the dispersion of the trace.
-    """
-    return int(min(max(BIN_PIXELS * angstrom_per_pixel, 1), _WIDEST_BIN))
-
-
 def bin_weights(width: int) -> Float:
     """Return the weights [6, width] with which `bin_electrons` divides the light of wavelengths among six bins.
 
-    Row i belongs to the bin i - BINS_BEFORE, counted from the bin that begins at the first of the `width` wavelengths.
+    Row i belongs to the bin i - BINS_BEFORE, counted from the bin at the first of the `width` wavelengths. Two rows are
+    negative.
     Lagrange's interpolation of fifth order has the same weights. The light, its mean wavelength and its central moments
     up to the fifth are therefore the same as without bins.
     """
@@ -63,6 +53,10 @@ def bin_electrons(spectrum: Float32, factor: float, response: Float, weights: Fl
     out : float array, shape (bins,)
         Result: electrons in bins of `width` wavelengths, to which this call adds. The bin BINS_BEFORE is at the first
         wavelength. There must be `bin_count` bins.
+
+    Notes
+    -----
+    Some weights are negative, so that bins next to an emission line can have negative electrons.
     """
     width = weights.shape[1]
     w0, w1, w2, w3, w4, w5 = weights
@@ -112,27 +106,33 @@ class Bins:
     wave_share: Float
 
     @classmethod
-    def from_trace(cls, along: Float, span: float, response: Float, wave_share: Float) -> Bins:
-        """Return bins that are narrow enough where the dispersion is largest. It varies along the traces of prisms.
+    def from_trace(
+        cls, along: Float, t: tuple[float, float], response: Float, wave_share: Float, pixels: float
+    ) -> Bins:
+        """Return the bins of one spectral order for a source at the first pixel of the detector.
 
         Parameters
         ----------
         along : float array, shape (i,)
-            Coefficients of t^i (i from 0) of the displacement from the undispersed image in columns, pixels. The
-            parameter t is linear in wavelength, from 0 to 1.
-        span : float
-            Difference of the wavelengths at which t is 1 and 0, Angstrom.
+            Coefficients of t^i (i from 0) of the displacement from the undispersed image in columns, pixels.
+        t : (float, float)
+            Value of t at the first wavelength of the spectrum, and step of t from one wavelength to the next.
         response, wave_share : float array, shape (w,) and (w, b)
             Attributes of the result.
+        pixels : float
+            Distance of the bins in columns where the dispersion is largest. If it is less than one wavelength, a bin is
+            one wavelength.
 
         Returns
         -------
         Bins
             The bins.
         """
-        columns = np.polynomial.polynomial.polyval(np.linspace(0.0, 1.0, _PLACES), along)
-        longest_step = max(float(np.abs(np.diff(columns)).max()), 1e-9)
-        width = bin_width(span / (_PLACES - 1) / longest_step)
+        # The dispersion varies along the traces of prisms, and spectra extend beyond the ends of the trace.
+        places = np.linspace(-BINS_BEFORE, len(response) + BINS_AFTER, _PLACES)
+        columns = np.polynomial.polynomial.polyval(t[0] + t[1] * places, along)
+        fastest = float(np.abs(np.diff(columns) / np.diff(places)).max())
+        width = int(min(max(pixels / max(fastest, 1e-9), 1.0), _WIDEST_BIN))
         wavelength = width * (np.arange(bin_count(len(response), width)) - BINS_BEFORE)
         share = np.ascontiguousarray(wave_share[np.clip(wavelength, 0, len(response) - 1)].T)
         return cls(response, bin_weights(width), share, wave_share)

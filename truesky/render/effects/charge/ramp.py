@@ -408,8 +408,8 @@ def _draw_ramps(
         squares[i] = 0.0
         for j in range(reads):
             squares[i] += float(i * (reads + drops) + j + 1) ** 2 / reads
-    # The pixels are processed in blocks, in loops that the compiler can vectorise. In memory, the rows of a block must
-    # not be a multiple of 4 KiB apart, because such addresses share their place in the processor's cache.
+    # The pixels are processed in blocks, in loops that the compiler can vectorise. Rows have 8 more elements than a
+    # block, because rows that are a multiple of 4 KiB apart in memory share their place in the processor's cache.
     block = pixel_random.BLOCK
     normals, bits = np.empty((groups + 1, block + 8)), np.empty(block, np.uint64)
     counts, work, rate = np.empty((groups, block + 8)), np.empty((5, block + 8)), np.empty(block)
@@ -475,8 +475,9 @@ def _draw_groups(rate: Any, shape: Any, cumulants: Any, e: Any, work: Any, count
     unit_v = (r + 1.0) * (2.0 * r + 1.0) / (6.0 * r)
     high, low = math.sqrt(unit_a + 2.0 * unit_b), math.sqrt(max(unit_a - 2.0 * unit_b, 0.0))
     # c0 and c1 are the coefficients of the moving average, and b is the covariance of successive differences. The
-    # formula c1 = (high - low) / 2 would lose digits for small b. Use c0 c1 = b instead. For f electrons per frame all
-    # moments are proportional to f, and c0 and c1 to its root.
+    # formula c1 = (high - low) / 2 would lose digits for small b. Use c0 c1 = b instead. The names with `unit_` are for
+    # one electron per frame. For f electrons, a, b, v and V_T are proportional to f, V_G to f^2, and c0 and c1 to the
+    # square root of f.
     unit_c0 = 0.5 * (high + low)
     unit_c1 = unit_b / unit_c0
     unit_first = math.sqrt(max(unit_v - unit_c1 * unit_c1, 0.0))

@@ -153,7 +153,7 @@ def test_drawing_every_frame_is_the_same_law(mode):
 @pytest.mark.parametrize("mode", [PHOTOMETRIC, SPECTROSCOPIC, ramp.Mode(2, 1, 0)], ids=str)
 def test_pixels_that_are_not_linear_against_every_frame(mode):
     """A hit, saturation and non-linearity without noise in the light: every pixel by its definition."""
-    rng, count = np.random.default_rng(4), 300
+    rng, count = np.random.default_rng(4), 1_300
     charge, moment = rng.uniform(0.0, 2e5, count), rng.uniform(0.0, 1.0, count)
     bend = rng.uniform(0.0, 1e-6, count)
     frame = np.array([np.zeros(count), charge, moment, bend])[:, None, :]
@@ -181,6 +181,20 @@ def test_non_linearity_is_the_same_where_the_law_changes():
     error = 4.5 * np.sqrt(2.0 * 2990.0 / count)
     assert law[-1].mean() == pytest.approx(drawn[-1].mean(), abs=error)
     assert (drawn[-1] - linear[-1]).mean() == pytest.approx(-bend * 2470.0**2, rel=0.3)
+
+
+def test_each_pixel_has_its_own_nonlinearity_in_the_linear_law():
+    """More pixels than the blocks in which they are drawn."""
+    rng, count = np.random.default_rng(5), 1_300
+    light = rng.uniform(0.0, 2000.0, (1, count))
+    bent = ramp.with_planes(light, 4)
+    bent[3] = rng.uniform(0.0, 1e-6, count)
+    law, linear = (ramp.apply(frame, PHOTOMETRIC, 1.3e5, rng=np.random.default_rng(6)) for frame in (bent, light))
+    rate = light / PHOTOMETRIC.integration_frames
+    starts = np.arange(PHOTOMETRIC.groups) * (PHOTOMETRIC.reads + PHOTOMETRIC.drops)
+    squares = ((starts[:, None] + np.arange(1, PHOTOMETRIC.reads + 1)) ** 2.0).mean(axis=1)
+    expected = bent[3] * rate**2 * squares[:, None, None]
+    np.testing.assert_allclose(linear - law, expected, rtol=1e-3, atol=5e-4)
 
 
 def test_the_same_pixel_has_the_same_ramp_whatever_its_neighbours_hold():
