@@ -264,7 +264,9 @@ def position_on_the_sky(values):
     found = float(sky.separation(ra, dec, *np.degrees([lon, lat])))
     expected = np.degrees(angular_separation(turned, np.radians(dec), lon, lat))
     assert 0.0 <= moved[0][0] < 360.0
-    return max(np.degrees(apart), abs(found - expected), distance_to_cell(ra, dec, order, cell))
+    # A distance of many circles is rounded by more than the allowed error when it is written in radians.
+    rounding = max(1.0, distance / 180.0)
+    return max(np.degrees(apart) / rounding, abs(found - expected), distance_to_cell(ra, dec, order, cell))
 
 
 def distance_to_cell(ra, dec, order, cell):
