@@ -46,8 +46,6 @@ _TILTS = (0.0, 4.0, -4.0)
 _BRIGHT, _FAINT = 17.0, 23.0
 # Electrons of a source of magnitude 0, for a zero point of 25.3 mag (1 electron per s) and 549.6 s.
 _ZERO = 549.6 * 10 ** (0.4 * 25.3)
-# Parameters of the slow method to which the drawn spectra are compared.
-TRUTH = Settings(edge=1e-5, faint=0.0, min_size=80, along=4, across=4, block=0.0, nodes=10, positions=9, bin=0.0)
 # Shape (ny, nx) of the image of one spectrum, pixels.
 _SHAPE = (128, 720)
 # Column and row at which the source of a spectrum would lie on the image without the grism. A random fraction of a
@@ -86,6 +84,11 @@ class SampleSource:
     continuum: Float32
     line: Float32
     place: tuple[float, float]
+
+
+def slow_settings() -> Settings:
+    """Return the settings of the slow method to which the drawn spectra are compared."""
+    return Settings(edge=1e-5, faint=0.0, min_size=80, along=4, across=4, block=0.0, nodes=10, positions=9, bin=0.0)
 
 
 def first_orders(tilt: float) -> tuple[Order, ...]:
@@ -253,9 +256,10 @@ def measure_settings(
         "": sample_sources(_CHOSEN_SEED, num_chosen),
         "_held": [source for seed in _TEST_SEEDS for source in sample_sources(seed, num_test)],
     }
-    psf = settings_psf(TRUTH)
+    slow = slow_settings()
+    psf = settings_psf(slow)
     truths = {
-        end: [draw_images(sample_source, TRUTH, psf) for sample_source in sample_list]
+        end: [draw_images(sample_source, slow, psf) for sample_source in sample_list]
         for end, sample_list in samples.items()
     }
     table_rows = []
